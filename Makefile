@@ -1,0 +1,32 @@
+# Two commands do everything on a fresh machine: `make demo` (the main job) and `make test`.
+# Both rest on `make setup`, which prepares .venv once and is cheap to repeat.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+
+.PHONY: help setup system demo test check bench docs clean
+
+help:  ## this list
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
+
+setup: $(STAMP)  ## prepare .venv with everything the demo and the tests need
+
+$(STAMP): pyproject.toml scripts/setup
+	@PYTHON="$(PYTHON)" scripts/setup $(VENV)
+	@touch $(STAMP)
+
+demo: setup  ## run the whole pipeline on a small synthetic data set and print the AP table
+	@$(BIN)/run_pipeline
+
+test: setup  ## all tests
+	@scripts/test
+
+check: setup  ## ruff, mypy, architecture
+	@scripts/check
+
+bench: setup  ## time our code beside its peers, write benchmarks/RESULTS.md
+	@$(BIN)/python -m benchmarks
+
+clean:  ## remove the environment and everything generated
+	rm -rf $(VENV) build *.egg-info runs .mypy_cache .ruff_cache
