@@ -1,0 +1,1 @@
+"""Benchmarks on real frames that need no depth ground truth (`run_pipeline --stage bench --suite real`)."""
