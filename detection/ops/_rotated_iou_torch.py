@@ -10,8 +10,6 @@ from torch import Tensor
 
 
 def on_device(numpy_function: Callable[..., Any], torch_function: Callable[..., Any], a: Tensor, b: Tensor) -> Tensor:
-    numpy_function: Callable[..., Any], torch_function: Callable[..., Tensor], a: Tensor, b: Tensor
-) -> Tensor:
     """Numba where the memory can be shared with numpy, torch elsewhere; no gradient, dtype and device of `a`."""
     for name, boxes in (("boxes_a", a), ("boxes_b", b)):
         if boxes.ndim != 2 or boxes.shape[1] != 7:
