@@ -1,1 +1,28 @@
+"""Data sets: `open_dataset(name, root)` gives frames whose parts are read when they are asked for."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from pipeline.data.dataset import Dataset
+from pipeline.data.frame import Frame
+from pipeline.data.kitti_object import open_kitti_object
+from pipeline.errors import UsageError
+
+__all__ = ["READERS", "Dataset", "Frame", "open_dataset"]
+
+# name -> reader; a reader takes the root folder and gives a Dataset
+READERS: dict[str, Callable[[Path], Dataset]] = {
+    "kitti_object": open_kitti_object,
+}
+
+
+def open_dataset(name: str, root: str | Path) -> Dataset:
+    """The data set `name` (a key of READERS) in the folder `root`.
+
+    Raises UsageError for an unknown name, a missing folder or a folder without frames.
+    """
+    if name not in READERS:
+        raise UsageError(f"unknown data set {name!r}; known: {', '.join(READERS)}")
+    return READERS[name](Path(root))

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,17 @@ class Frame:
     def has(self, part: str) -> bool:
         """True when the data set offers this part for this frame (its file may still turn out to be damaged)."""
         return part in self.loaders
+
+    def files(self, part: str) -> tuple[Path, ...]:
+        """The files `part` is read from: the paths among its loader's arguments (readers use functools.partial).
+
+        Empty when the loader names none; the runner then recognises a changed part by its content.
+        """
+        loader = self.loaders.get(part)
+        if not isinstance(loader, partial):
+            return ()
+        arguments = (*loader.args, *loader.keywords.values())
+        return tuple(argument for argument in arguments if isinstance(argument, Path))
 
     def _load(self, part: str) -> Any:
         if part not in self.loaders:

@@ -1,0 +1,143 @@
+"""Images from disk, with the checks that OpenCV leaves out: it fills the missing rows of a truncated file silently."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import DataError
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+JPEG_SIGNATURE = b"\xff\xd8"
+# Larger than any camera of the field; a header that claims more is damage, and is refused before memory is taken.
+MAX_PIXELS = 64_000_000
+MAX_FILE_BYTES = 512 * 1024 * 1024
+# JPEG markers that hold the frame size (SOF0-SOF15 without DHT, JPG, DAC); ITU-T T.81 table B.1.
+_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+
+
+def read_bytes(path: Path, what: str) -> bytes:
+    """The bytes of a regular, readable, non-empty file. Raises DataError that names `what` was expected."""
+    try:
+        size = path.stat().st_size
+        if size > MAX_FILE_BYTES:
+            raise DataError(path, what, f"a file of {size / 1e9:.1f} GB")
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise DataError(path, what, "no such file") from None
+    except IsADirectoryError:
+        raise DataError(path, what, "a folder") from None
+    except PermissionError:
+        raise DataError(path, what, "a file that may not be read", "check its permissions") from None
+    if not data:
+        raise DataError(path, what, "an empty file", "was the disk full when it was written?")
+    return data
+
+
+def read_image(path: str | Path) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 RGB of a PNG or JPEG file of any size; grey images are repeated over the three channels.
+
+    Raises DataError when the file is missing, empty, truncated, too large or no image.
+    """
+    import cv2
+
+    path = Path(path)
+    data = read_bytes(path, "a PNG or JPEG image")
+    check_complete(data, path)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise DataError(path, "a PNG or JPEG image", "data that cannot be decoded")
+    return np.ascontiguousarray(image[:, :, ::-1])
+
+
+def read_unchanged(path: str | Path, what: str) -> NDArray[Any]:
+    """The pixels of a PNG file as stored (uint8 or uint16, (H, W) or (H, W, C) in OpenCV's channel order).
+
+    Raises DataError when the file is missing, empty, truncated, too large or no PNG.
+    """
+    import cv2
+
+    path = Path(path)
+    data = read_bytes(path, what)
+    if not data.startswith(PNG_SIGNATURE):
+        raise DataError(path, what, f"a file starting with {data[:4]!r}")
+    check_complete(data, path)
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise DataError(path, what, "data that cannot be decoded")
+    return np.asarray(pixels)
+
+
+def image_size(path: str | Path) -> tuple[int, int]:
+    """(height, width) in pixels from the header of a PNG or JPEG file; the pixels are not decoded."""
+    path = Path(path)
+    data = read_bytes(path, "a PNG or JPEG image")
+    return _png_size(data, path) if data.startswith(PNG_SIGNATURE) else _jpeg_size(data, path)
+
+
+def check_complete(data: bytes, path: Path) -> None:
+    """Raises DataError unless `data` is a whole PNG (every chunk, checksums, IEND) or JPEG (end marker) of sane size."""
+    if data.startswith(PNG_SIGNATURE):
+        _png_size(data, path)
+        kinds = [kind for kind, _ in _png_chunks(data, path)]
+        if not kinds or kinds[-1] != b"IEND":
+            raise DataError(path, "a complete PNG image", f"a file that ends after {len(data)} bytes", _TRUNCATED)
+    elif data.startswith(JPEG_SIGNATURE):
+        _jpeg_size(data, path)
+        if not data.rstrip(b"\0").endswith(b"\xff\xd9"):
+            raise DataError(path, "a complete JPEG image", f"a file that ends after {len(data)} bytes", _TRUNCATED)
+    else:
+        raise DataError(path, "a PNG or JPEG image", f"a file starting with {data[:4]!r}")
+
+
+_TRUNCATED = "it is truncated: copy or download it again"
+
+
+def _png_chunks(data: bytes, path: Path) -> Iterator[tuple[bytes, int]]:
+    """(kind, offset of its data) of each whole chunk of a PNG; stops at the first that runs over the end."""
+    position = len(PNG_SIGNATURE)
+    while position + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, position)
+        end = position + 12 + length
+        if end > len(data):
+            return
+        (checksum,) = struct.unpack_from(">I", data, end - 4)
+        if zlib.crc32(data[position + 4 : end - 4]) != checksum:
+            raise DataError(path, "a PNG whose checksums agree", f"a damaged {kind!r} chunk at byte {position}")
+        yield kind, position + 8
+        if kind == b"IEND":
+            return
+        position = end
+
+
+def _png_size(data: bytes, path: Path) -> tuple[int, int]:
+    if len(data) < 33 or data[12:16] != b"IHDR":
+        raise DataError(path, "a PNG with a header", f"{len(data)} bytes", _TRUNCATED)
+    width, height = struct.unpack_from(">II", data, 16)
+    return _sane_size(height, width, path)
+
+
+def _jpeg_size(data: bytes, path: Path) -> tuple[int, int]:
+    position = 2
+    while data.startswith(JPEG_SIGNATURE) and position + 9 <= len(data) and data[position] == 0xFF:
+        marker = data[position + 1]
+        if marker in _SIZE_MARKERS:
+            height, width = struct.unpack_from(">HH", data, position + 5)
+            return _sane_size(height, width, path)
+        if marker == 0xFF or 0xD0 <= marker <= 0xD7:  # fill byte or restart marker: no length follows
+            position += 1 if marker == 0xFF else 2
+            continue
+        position += 2 + struct.unpack_from(">H", data, position + 2)[0]
+    raise DataError(path, "a PNG or JPEG image", f"a file starting with {data[:4]!r} without an image size")
+
+
+def _sane_size(height: int, width: int, path: Path) -> tuple[int, int]:
+    if not 0 < height * width <= MAX_PIXELS:
+        raise DataError(path, f"an image of 1 to {MAX_PIXELS:,} pixels", f"a header of {width} x {height}")
+    return height, width

@@ -1,0 +1,47 @@
+"""Files that appear complete or not at all: write beside the target, flush to the disk, rename over it."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import time
+from pathlib import Path
+
+TEMPORARY_PREFIX = ".writing-"
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Writes `data` to `path` atomically; the folder is made when it does not exist.
+
+    Raises OSError when the disk is full or the folder cannot be written; then nothing is left behind.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.parent / f"{TEMPORARY_PREFIX}{os.getpid()}-{secrets.token_hex(4)}"
+    try:
+        with open(temporary, "xb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """`write_bytes` for UTF-8 text."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def remove_leftovers(folder: Path) -> int:
+    """Removes temporary files that a killed run left under `folder` more than an hour ago; returns how many.
+
+    The hour keeps the files of another process that is writing into the same run at this moment.
+    """
+    old = time.time() - 3600
+    removed = 0
+    for path in folder.rglob(TEMPORARY_PREFIX + "*"):
+        if path.is_file() and path.stat().st_mtime < old:
+            path.unlink(missing_ok=True)
+            removed += 1
+    return removed
