@@ -1,8 +1,8 @@
 """Depth completion on real frames, scored on LiDAR rings that were kept back.
 
-A 64-ring scan gives every 2nd, 4th or 8th ring to the method; the visible returns of the other rings are the truth. Three
-questions are asked: how large is the error (MAE, RMSE, and with errors capped at 1 m, tMAE and tRMSE), how often does the
-method invent a depth between two surfaces (mixed), and how large is the capped error at depth edges (edge tMAE).
+A 64-ring scan gives every 2nd, 4th or 8th ring to the method; the visible returns of the other rings are the truth.
+Three questions are asked: how large is the error (MAE, RMSE, and with errors capped at 1 m, tMAE and tRMSE), how often
+does the method invent a depth between two surfaces (mixed), and how large is the capped error at depth edges.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pipeline.simulation.lidar_rows import split_rings
 Array = NDArray[np.float64]
 
 ROW_STEPS = {32: 2, 16: 4, 8: 8}
-# "Clean" windows: nothing was measured between the two surfaces within 8 columns and so many rows (half an input gap + 3).
+# "Clean" windows: nothing measured between the two surfaces within 8 columns and so many rows (half an input gap + 3).
 CLEAN_ROWS = {2: 10, 4: 16, 8: 28}
 CLEAN_COLUMNS = 8
 MARGIN = 0.5

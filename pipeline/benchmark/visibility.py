@@ -1,9 +1,9 @@
 """Which LiDAR returns does the camera really see?
 
-LiDAR and camera stand apart, so background returns show through foreground objects in the projection. A window test on the
-projected points cannot tell them apart (rings are 4-6 pixels apart, leaks reach 15 pixels). Here a surface is built in the
-LiDAR's own order, where neighbours are known, sampled densely and z-buffered in the camera; a return well behind it is
-occluded.
+LiDAR and camera stand apart, so background returns show through foreground objects in the projection. A window test on
+the projected points cannot tell them apart (rings are 4-6 pixels apart, leaks reach 15 pixels). Here a surface is built
+in the LiDAR's own order, where neighbours are known, sampled densely and z-buffered in the camera; a return well behind
+it is occluded.
 """
 
 from __future__ import annotations
@@ -93,15 +93,13 @@ def visible_points(
 def _neighbours_in_ring(azimuth: Array, ring: NDArray[np.integer], ranges: Array) -> NDArray[np.bool_]:
     """(N,) True where point i and i + 1 are linked within their ring."""
     linked = np.zeros(len(azimuth), dtype=bool)
-    linked[:-1] = (
-        (ring[1:] == ring[:-1]) & (np.diff(azimuth) <= RING_STEP) & same_surface(ranges[:-1], ranges[1:])
-    )
+    linked[:-1] = (ring[1:] == ring[:-1]) & (np.diff(azimuth) <= RING_STEP) & same_surface(ranges[:-1], ranges[1:])
     return linked
 
 
 @njit(cache=True)
 def _neighbours_below(azimuth, ring, ranges):  # type: ignore[no-untyped-def]
-    """(N,) index of the point of the next ring nearest in azimuth when linked, else -1; points sorted by ring, azimuth."""
+    """(N,) index of the linked point of the next ring, or -1; the points come sorted by ring and azimuth."""
     n = len(azimuth)
     below = np.full(n, -1, dtype=np.int64)
     rings = int(ring.max()) + 1 if n else 0
