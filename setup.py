@@ -1,0 +1,8 @@
+"""Everything is in pyproject.toml but this: configs/ at the root is installed as pipeline/configs."""
+
+from setuptools import find_packages, setup
+
+setup(
+    packages=[*find_packages(include=["completion*", "detection*", "pipeline*"]), "pipeline.configs"],
+    package_dir={"pipeline.configs": "configs"},
+)
