@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from pipeline.data.frame import Frame
@@ -56,12 +57,13 @@ class Dataset:
         """The same data set with fewer frames.
 
         frames  "a:b" (positions, b excluded, either may be left out), range or slice of positions, a split file
-                (one id a line, blank lines and lines starting with '#' skipped), a comma-separated list or ids
+                (one id a line, blank lines and lines starting with '#' skipped), a comma-separated list or ids;
+                an entry with * or ? is a pattern ("Scene20/clone/*")
         Raises UsageError when a frame is not in the data set or a split file does not exist.
         """
         wanted = self._positions(frames)
         if wanted is None:
-            wanted = tuple(_names(frames))  # type: ignore[arg-type]
+            wanted = tuple(name for entry in _names(frames) for name in self._matching(entry))  # type: ignore[arg-type]
         missing = [frame_id for frame_id in wanted if frame_id not in self._known]
         if missing:
             shown = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
@@ -69,6 +71,12 @@ class Dataset:
                 f"{len(missing)} of {len(wanted)} frames asked for are not in {self.root or self.name}: {shown}"
             )
         return replace(self, ids=wanted)
+
+    def _matching(self, entry: str) -> list[str]:
+        """The ids of a pattern, or the entry itself when it is not one."""
+        if not any(sign in entry for sign in "*?"):
+            return [entry]
+        return [frame_id for frame_id in self.ids if fnmatchcase(frame_id, entry)] or [entry]
 
     def _positions(self, frames: object) -> tuple[str, ...] | None:
         """Ids at a range or slice of positions, or None when `frames` is neither."""

@@ -85,7 +85,7 @@ def _tree_ids(root: Path) -> list[str]:
 
 
 def open_tree_frame(root: Path, frame_id: str) -> Frame:
-    """The frame "SPLIT/DRIVE_sync/CAMERA/FRAME"; image, calibration and cloud are offered when its raw drive is there."""
+    """The frame "SPLIT/DRIVE_sync/CAMERA/FRAME"; image, calibration and cloud need its raw drive."""
     split, drive, camera, name = frame_id.split("/")
 
     def depth_path(kind: str) -> Path:
@@ -238,7 +238,7 @@ def official_crop(size: tuple[int, int], crop: tuple[int, int] = (352, 1216)) ->
 
 
 def cropped_frame(frame: Frame, crop: tuple[int, int] = (352, 1216)) -> Frame:
-    """The same frame cut to the bottom-centre crop: maps, image and calibration; cloud and 3D labels stay as they are."""
+    """The same frame cut to the bottom-centre crop: image, maps and calibration (not cloud and 3D labels)."""
     top, left = official_crop(frame.image_size, crop)
     window = np.s_[top : top + crop[0], left : left + crop[1]]
     maps = ("image", "sparse_depth", "target_depth", "semantics", "instances")

@@ -1,0 +1,181 @@
+"""Point cloud files: KITTI .bin, .npy, PLY and PCD, read and written with named columns.
+
+PLY and PCD are written as binary little-endian float32, one property or field per column, so that every per-point
+column of an augmented cloud (sigma, surfaces, source, ...) reaches the viewer. Sources: Turk, "The PLY polygon file format",
+1994; the PCD 0.7 format page of the Point Cloud Library.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data.images import read_bytes
+from pipeline.data.kitti_object import read_velodyne
+from pipeline.errors import DataError
+
+SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
+_PLY_TYPES = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
+# A header longer than this is not a header.
+_MAX_HEADER = 65536
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """values (N, C) float32 and the names of the C columns, x y z first."""
+
+    values: NDArray[np.float32]
+    columns: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if self.values.ndim != 2 or self.values.shape[1] != len(self.columns):
+            raise ValueError(f"cloud: {self.values.shape} values do not fit the columns {self.columns}")
+
+    def column(self, name: str) -> NDArray[np.float32]:
+        """(N,) one column by name."""
+        return self.values[:, self.columns.index(name)]
+
+
+def read_points(path: str | Path) -> NDArray[np.float32]:
+    """(N, 4) float32 x y z intensity of a .bin, .npy, .ply or .pcd file; intensity 0 when the file has none."""
+    path = Path(path)
+    if path.suffix == ".bin":
+        return read_velodyne(path)
+    cloud = read_cloud(path)
+    wanted = [cloud.column(name) for name in ("x", "y", "z")]
+    intensity = next((name for name in ("intensity", "reflectance", "i") if name in cloud.columns), None)
+    wanted.append(cloud.column(intensity) if intensity else np.zeros(len(cloud.values), np.float32))
+    points = np.column_stack(wanted).astype(np.float32)
+    if not np.isfinite(points).all():
+        bad = int((~np.isfinite(points)).any(axis=1).sum())
+        raise DataError(path, "finite points", f"{bad} of {len(points)} points with NaN or infinite values")
+    return points
+
+
+def read_cloud(path: str | Path) -> Cloud:
+    """All columns of a .npy, .ply or .pcd file. Raises DataError on damage or an unknown format."""
+    path = Path(path)
+    if path.suffix not in SUFFIXES[1:]:
+        raise DataError(path, f"a point cloud ({', '.join(SUFFIXES)})", f"a {path.suffix or 'nameless'} file")
+    data = read_bytes(path, "a point cloud")
+    if path.suffix == ".npy":
+        return _read_npy(data, path)
+    cloud = _read_ply(data, path) if path.suffix == ".ply" else _read_pcd(data, path)
+    if cloud.columns[:3] != ("x", "y", "z") and not {"x", "y", "z"} <= set(cloud.columns):
+        raise DataError(path, "columns x y z", ", ".join(cloud.columns))
+    return cloud
+
+
+def _read_npy(data: bytes, path: Path) -> Cloud:
+    try:
+        array = np.load(io.BytesIO(data), allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise DataError(path, "a .npy array of numbers", str(error)) from None
+    if array.ndim != 2 or array.shape[1] < 3:
+        raise DataError(path, "an (N, 3 or more) array", f"shape {array.shape}")
+    names = ("x", "y", "z", "intensity", *(f"column{i}" for i in range(4, array.shape[1])))
+    return Cloud(array.astype(np.float32), names[: array.shape[1]])
+
+
+def ply_bytes(cloud: Cloud) -> bytes:
+    """A binary little-endian PLY with one float property per column."""
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud.values)}"]
+    lines += [f"property float {name}" for name in cloud.columns]
+    header = "\n".join([*lines, "end_header"]) + "\n"
+    return header.encode("ascii") + np.ascontiguousarray(cloud.values, dtype="<f4").tobytes()
+
+
+def pcd_bytes(cloud: Cloud) -> bytes:
+    """A binary PCD 0.7 file with one float32 field per column."""
+    count, fields = len(cloud.values), len(cloud.columns)
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"
+        f"FIELDS {' '.join(cloud.columns)}\nSIZE {' '.join(['4'] * fields)}\nTYPE {' '.join(['F'] * fields)}\n"
+        f"COUNT {' '.join(['1'] * fields)}\nWIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\n"
+        "DATA binary\n"
+    )
+    return header.encode("ascii") + np.ascontiguousarray(cloud.values, dtype="<f4").tobytes()
+
+
+def _header(data: bytes, last: bytes, path: Path) -> tuple[list[str], int]:
+    """Lines of a text header up to the line starting with `last`, and the offset behind it."""
+    start = data.find(last, 0, _MAX_HEADER)
+    end = data.find(b"\n", start, start + 200) if start >= 0 else -1
+    if end < 0:
+        raise DataError(path, f"a header that ends with '{last.decode()}'", f"a file starting with {data[:8]!r}")
+    return data[:end].decode("latin-1").splitlines(), end + 1
+
+
+def _read_ply(data: bytes, path: Path) -> Cloud:
+    lines, offset = _header(data, b"end_header", path)
+    count, names, types, kind, element = 0, [], [], "", ""
+    for words in (line.split() for line in lines):
+        if words[:1] == ["format"]:
+            kind = words[1]
+        elif words[:1] == ["element"]:
+            element = words[1]
+            count = int(words[2]) if element == "vertex" else count
+        elif words[:1] == ["property"] and element == "vertex":
+            if words[1] not in _PLY_TYPES:
+                raise DataError(path, "number properties of the vertices", " ".join(words))
+            names.append(words[-1])
+            types.append(_PLY_TYPES[words[1]])
+    order = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}.get(kind)
+    if order is None or not names:
+        raise DataError(path, "a PLY file with vertices", f"format {kind or 'unknown'} with {len(names)} properties")
+    return _table(data[offset:], count, names, [order + t if order else t for t in types], kind == "ascii", path)
+
+
+def _read_pcd(data: bytes, path: Path) -> Cloud:
+    lines, offset = _header(data, b"DATA ", path)
+    header = {words[0]: words[1:] for words in (line.split() for line in lines) if words and words[0] != "#"}
+    try:
+        names, kind, count = header["FIELDS"], header["DATA"][0], int(header["POINTS"][0])
+        letters = {"F": "f", "I": "i", "U": "u"}
+        types = [f"<{letters[t]}{int(s)}" for t, s in zip(header["TYPE"], header["SIZE"])]
+        repeats = [int(word) for word in header.get("COUNT", ["1"] * len(names))]
+    except (KeyError, IndexError, ValueError) as error:
+        raise DataError(path, "a PCD header (FIELDS SIZE TYPE COUNT POINTS DATA)", f"trouble with {error}") from None
+    if kind not in ("ascii", "binary") or any(repeat != 1 for repeat in repeats):
+        raise DataError(path, "PCD data 'ascii' or 'binary' with one value per field", f"{kind}, COUNT {repeats}")
+    return _table(data[offset:], count, names, types, kind == "ascii", path)
+
+
+def _table(data: bytes, count: int, names: list[str], types: list[str], text: bool, path: Path) -> Cloud:
+    """The rows behind a header, as float32 columns."""
+    if text:
+        words = data.split()[: count * len(names)]
+        if len(words) != count * len(names):
+            raise DataError(path, f"{count} points of {len(names)} values", f"{len(words)} values")
+        try:
+            values = np.array(words, dtype=np.float64).reshape(count, len(names))
+        except ValueError as error:
+            raise DataError(path, "numbers", str(error)) from None
+        return Cloud(values.astype(np.float32), tuple(names))
+    row = np.dtype([(f"c{index}", kind) for index, kind in enumerate(types)])
+    if len(data) < count * row.itemsize:
+        raise DataError(path, f"{count} points of {row.itemsize} bytes", f"{len(data)} bytes", "the file is truncated")
+    rows = np.frombuffer(data, dtype=row, count=count)
+    columns = [rows[f"c{index}"].astype(np.float32) for index in range(len(names))]
+    return Cloud(np.column_stack(columns) if columns else np.zeros((count, 0), np.float32), tuple(names))
