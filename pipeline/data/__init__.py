@@ -6,8 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pipeline.data.dataset import Dataset
+from pipeline.data.folder import open_folder
 from pipeline.data.frame import Frame
+from pipeline.data.kitti_depth import open_kitti_depth
 from pipeline.data.kitti_object import open_kitti_object
+from pipeline.data.kitti_raw import open_kitti_raw
+from pipeline.data.nyuv2 import open_nyuv2
+from pipeline.data.vkitti2 import open_vkitti2
 from pipeline.errors import UsageError
 
 __all__ = ["READERS", "Dataset", "Frame", "open_dataset"]
@@ -15,6 +20,11 @@ __all__ = ["READERS", "Dataset", "Frame", "open_dataset"]
 # name -> reader; a reader takes the root folder and gives a Dataset
 READERS: dict[str, Callable[[Path], Dataset]] = {
     "kitti_object": open_kitti_object,
+    "kitti_depth": open_kitti_depth,
+    "kitti_raw": open_kitti_raw,
+    "vkitti2": open_vkitti2,
+    "nyuv2": open_nyuv2,
+    "folder": open_folder,
 }
 
 

@@ -1,8 +1,8 @@
 """Point cloud files: KITTI .bin, .npy, PLY and PCD, read and written with named columns.
 
 PLY and PCD are written as binary little-endian float32, one property or field per column, so that every per-point
-column of an augmented cloud (sigma, surfaces, source, ...) reaches the viewer. Sources: Turk, "The PLY polygon file format",
-1994; the PCD 0.7 format page of the Point Cloud Library.
+column of an augmented cloud (sigma, surfaces, source, ...) reaches the viewer. Sources: Turk, "The PLY polygon file
+format", 1994; the PCD 0.7 format page of the Point Cloud Library.
 """
 
 from __future__ import annotations
