@@ -1,0 +1,252 @@
+"""KITTI average precision of two folders (or of objects in memory): 2D, AOS, BEV and 3D, as the official devkit.
+
+Protocol: KITTI object development kit (Geiger et al., CVPR 2012); 40 recall points after Simonelli et al. (ICCV 2019).
+Explained with figures in docs/evaluation.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypedDict
+
+from detection.evaluation.curves import RECALL_POINTS, Curve, average_precision, curve_of, exact_ap
+from detection.evaluation.difficulty import LEVELS, DifficultyRule, KittiDifficulty, Vkitti2Difficulty
+from detection.evaluation.matching import MatchRecords
+from detection.evaluation.objects import FrameObjects
+from detection.evaluation.protocol import EVERYWHERE, METRICS, Matcher, Range, Target, levels, targets_of
+from detection.evaluation.reading import PathLike, read_pair
+
+ApRow = TypedDict(
+    "ApRow",
+    {
+        "class": str,
+        "metric": str,
+        "iou": float,
+        "recall_points": int,
+        "range": list[float | None],
+        "easy": float | None,
+        "moderate": float | None,
+        "hard": float | None,
+        "n_gt": list[int],
+    },
+)
+
+
+class Report(TypedDict):
+    """What `evaluate` returns and `--json` writes.
+
+    results   one row per class, metric, IoU and range; AP in percent, None where a class has no detections
+    exact     the same rows with all-point AP (not comparable with published numbers, not capped on small sets)
+    recall    the same rows with the share of labels found when every detection is admitted, percent
+    warnings  what a reader of the numbers must know, one sentence each
+    skipped   kind -> count of what a lenient reading passed over
+    protocol  the choices that were made
+    """
+
+    results: list[ApRow]
+    exact: list[dict[str, Any]]
+    recall: list[dict[str, Any]]
+    warnings: list[str]
+    skipped: dict[str, int]
+    protocol: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Labels and detections matched for a list of targets; everything else is read off its records.
+
+    recall_points  40 or 11
+    """
+
+    matcher: Matcher
+    targets: tuple[Target, ...]
+    recall_points: int = 40
+
+    def __post_init__(self) -> None:
+        if self.recall_points not in RECALL_POINTS:
+            raise ValueError(f"recall points: expected 40 or 11, got {self.recall_points}")
+
+    @cached_property
+    def records(self) -> dict[Target, tuple[MatchRecords, ...]]:
+        """Match records per target at easy, moderate and hard; AOS shares those of 2D."""
+        found: dict[tuple[str, str, float, Range], tuple[MatchRecords, ...]] = {}
+        for target in self.targets:
+            key = (target.cls, target.overlap, target.iou, target.range)
+            if key not in found:
+                found[key] = tuple(levels(self.matcher, target))
+        return {target: found[(target.cls, target.overlap, target.iou, target.range)] for target in self.targets}
+
+    def curves(self, target: Target) -> tuple[Curve, ...]:
+        """The sampled curves at easy, moderate and hard."""
+        return tuple(curve_of(records) for records in self.records[target])
+
+    def average_precision(self, target: Target) -> tuple[float | None, ...]:
+        """AP in percent at easy, moderate and hard; None where the reference gives no value."""
+        if not self.matcher.is_evaluated(target):
+            return (None, None, None)
+        samples = [c.orientation() if target.metric == "aos" else c.precision() for c in self.curves(target)]
+        return tuple(average_precision(values, self.recall_points) for values in samples)
+
+    def rows(self) -> list[ApRow]:
+        """The result rows, in the order asked for."""
+        rows = []
+        for target in self.targets:
+            easy, moderate, hard = self.average_precision(target)
+            row: ApRow = {
+                "class": target.cls,
+                "metric": target.metric,
+                "iou": target.iou,
+                "recall_points": self.recall_points,
+                "range": list(target.range),
+                "easy": easy,
+                "moderate": moderate,
+                "hard": hard,
+                "n_gt": [int(records.n_labels.sum()) for records in self.records[target]],
+            }
+            rows.append(row)
+        return rows
+
+    def report(self) -> Report:
+        """Everything `evaluate` returns."""
+        matcher = self.matcher
+        problems = matcher.pair.problems
+        rows = self.rows()
+        return {
+            "results": rows,
+            "exact": [self._side_row(target, exact_ap) for target in self.targets if target.metric != "aos"],
+            "recall": [self._side_row(target, found_share) for target in self.targets if target.metric != "aos"],
+            "warnings": [*small_set_warnings(rows), *(message for _, message in problems)],
+            "skipped": {kind: sum(1 for found, _ in problems if found == kind) for kind, _ in problems},
+            "protocol": {
+                "flavor": matcher.flavor,
+                "difficulty": type(matcher.difficulty).__name__,
+                "range_rule": matcher.range_rule,
+                "range_axis": matcher.range_axis,
+                "frames": len(matcher.pair.frames),
+                "labels": len(matcher.pair.labels),
+                "detections": len(matcher.pair.detections),
+            },
+        }
+
+    def _side_row(self, target: Target, value: Any) -> dict[str, Any]:
+        known = self.matcher.is_evaluated(target)
+        numbers = {name: value(r) if known else None for name, r in zip(LEVELS, self.records[target])}
+        return {
+            "class": target.cls,
+            "metric": target.metric,
+            "iou": target.iou,
+            "range": list(target.range),
+            **numbers,
+        }
+
+
+def found_share(records: MatchRecords) -> float:
+    """Share in percent of the labels that count which are found when every detection is admitted."""
+    n_labels = int(records.n_labels.sum())
+    return 100.0 * int(records.tp.sum()) / n_labels if n_labels else 0.0
+
+
+def small_set_warnings(rows: Sequence[ApRow]) -> list[str]:
+    """One sentence per class, range and level with fewer than 41 labels that count, where AP cannot reach 100."""
+    sentences: dict[str, None] = {}
+    for row in rows:
+        lo, hi = row["range"]
+        where = "" if (lo, hi) == EVERYWHERE else f" at {lo:g}-{'inf' if hi is None else f'{hi:g}'} m"
+        for level, n in zip(LEVELS, row["n_gt"]):
+            if n >= 41:
+                continue
+            cap = max(n - 1, 0) / 40 if row["recall_points"] == 40 else ((n - 1) // 4 + 1) / 11
+            sentences[
+                f"{row['class']} {level}{where}: only {n} objects count; with fewer than 41 even a perfect detector "
+                f"gets AP {100 * cap:.1f} of 100 (R{row['recall_points']}). Do not compare this number; see the exact AP"
+            ] = None
+    return list(sentences)
+
+
+def prepare(
+    labels: PathLike | FrameObjects,
+    detections: PathLike | FrameObjects,
+    *,
+    classes: Sequence[str] = ("Car", "Pedestrian", "Cyclist"),
+    metrics: Sequence[str] = METRICS,
+    recall: int = 40,
+    iou_set: str = "both",
+    ious: Mapping[str, float] | None = None,
+    flavor: str = "cpp",
+    ranges: Sequence[Range] = (EVERYWHERE,),
+    range_rule: str = "clocs",
+    range_axis: str = "z",
+    difficulty: str | DifficultyRule = "kitti",
+    frames: Sequence[str] | None = None,
+    missing: str = "error",
+    lenient: bool = False,
+) -> Evaluation:
+    """Read both sides and set up the evaluation; the arguments are those of `evaluate`."""
+    targets = targets_of(classes, iou_set, ious or {}, ranges, metrics)
+    if isinstance(difficulty, str):
+        rules: dict[str, DifficultyRule] = {"kitti": KittiDifficulty(flavor), "vkitti2": Vkitti2Difficulty()}
+        if difficulty not in rules:
+            raise ValueError(f"difficulty: expected one of {', '.join(rules)}, got {difficulty!r}")
+        difficulty = rules[difficulty]
+    pair = read_pair(labels, detections, frames=frames, missing=missing, lenient=lenient)
+    return Evaluation(Matcher(pair, flavor, range_rule, range_axis, difficulty), targets, recall)
+
+
+def evaluate(
+    labels: PathLike | FrameObjects,
+    detections: PathLike | FrameObjects,
+    *,
+    classes: Sequence[str] = ("Car", "Pedestrian", "Cyclist"),
+    metrics: Sequence[str] = METRICS,
+    recall: int = 40,
+    iou_set: str = "both",
+    ious: Mapping[str, float] | None = None,
+    flavor: str = "cpp",
+    ranges: Sequence[Range] = (EVERYWHERE,),
+    range_rule: str = "clocs",
+    range_axis: str = "z",
+    difficulty: str | DifficultyRule = "kitti",
+    frames: Sequence[str] | None = None,
+    missing: str = "error",
+    lenient: bool = False,
+) -> Report:
+    """KITTI AP of detections against labels; the same numbers as `run_pipeline --stage evaluate`.
+
+    labels      folder of KITTI label files (15 columns), or frame name -> list of KittiObject, or a list of such lists
+    detections  folder of KITTI result files (16 columns, the score last), or the same in memory with scores
+    classes     names to evaluate; upper and lower case alike
+    metrics     some of "2d", "aos", "bev", "3d"
+    recall      40 or 11 recall points
+    iou_set     "strict" (Car 0.7, others 0.5), "loose" (bev and 3d: 0.5 and 0.25) or "both"
+    ious        class -> IoU that replaces the sets for that class
+    flavor      "cpp": the official devkit; "python": the widely used port (a label exactly 40 or 25 px high is ignored,
+                DontCare is written so and known in the image only, AOS is judged by the first detection)
+    ranges      pairs (lo, hi) in metres, lo <= distance < hi, hi None = no limit; (0, None) = everything
+    range_rule  "clocs": labels outside are ignored, detections outside dropped; "border": a detection outside that
+                overlaps a label inside still counts, and others outside are ignored
+    range_axis  "z": depth along the optical axis; "radius": distance on the ground
+    difficulty  "kitti", "vkitti2" or a DifficultyRule
+    frames      frames to evaluate (a split); None = every labelled frame
+    missing     a frame without result file: "error", "skip" (as the official offline tool) or "empty"
+    lenient     pass over broken lines, missing files and results of unknown frames; counted in "skipped"
+    Raises ValueError (InputError with file and line for bad files).
+    """
+    return prepare(
+        labels,
+        detections,
+        classes=classes,
+        metrics=metrics,
+        recall=recall,
+        iou_set=iou_set,
+        ious=ious,
+        flavor=flavor,
+        ranges=ranges,
+        range_rule=range_rule,
+        range_axis=range_axis,
+        difficulty=difficulty,
+        frames=frames,
+        missing=missing,
+        lenient=lenient,
+    ).report()
