@@ -1,0 +1,141 @@
+"""Weights on disk: NAME.safetensors and NAME.json, a card that says which network they fit and how they were made.
+
+Both are written by atomic rename. The card holds the SHA-256 of the weights; a file that does not match its card, or
+tensors that do not match the network, are refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import Tensor, nn
+
+from completion.models import ModelSpec, build_model
+
+FORMAT = "auglidar-completion-1"
+WEIGHTS = Path(__file__).resolve().parent / "weights"
+
+
+class CheckpointError(ValueError):
+    """A weights file that cannot be used: which file, what was expected, what came."""
+
+
+@dataclass(frozen=True)
+class Card:
+    """What a checkpoint is.
+
+    model      how to rebuild the network and scale its inputs
+    read_out   how one depth is read from the output by default (see twin_surface.READ_OUTS; "all" or "peak" for DC)
+    training   free facts: data, seeds, command, hours, metrics, limits, or the source of imported weights
+    sha256     of the safetensors file
+    """
+
+    model: ModelSpec
+    read_out: str = "fused"
+    training: Mapping[str, Any] = field(default_factory=dict)
+    sha256: str = ""
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file so that a reader sees the old or the new content, never a part; survives a kill at any moment."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with open(temporary, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def save_checkpoint(path: str | Path, model: nn.Module, card: Card) -> Path:
+    """Write PATH.safetensors and PATH.json (any suffix of `path` is replaced); returns the safetensors path."""
+    weights_path = Path(path).with_suffix(".safetensors")
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
+    content = save_tensors(tensors)
+    described = {
+        "format": FORMAT,
+        "sha256": hashlib.sha256(content).hexdigest(),
+        "model": asdict(card.model),
+        "read_out": card.read_out,
+        "training": dict(card.training),
+    }
+    write_atomically(weights_path, content)
+    write_atomically(weights_path.with_suffix(".json"), json.dumps(described, indent=1).encode())
+    return weights_path
+
+
+def find_weights(path_or_name: str | Path) -> Path:
+    """The .safetensors file of a path (with or without suffix) or of an embedded name. CheckpointError if there is none."""
+    given = Path(path_or_name)
+    for candidate in (given.with_suffix(".safetensors"), WEIGHTS / f"{path_or_name}.safetensors"):
+        if candidate.is_file():
+            return candidate
+    embedded = ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none"
+    raise CheckpointError(
+        f"{path_or_name}: no such weights; give the path of a .safetensors file or one of: classical, {embedded}"
+    )
+
+
+def read_card(weights_path: Path) -> Card:
+    """The card beside a safetensors file. CheckpointError when it is missing, damaged or of another format."""
+    path = weights_path.with_suffix(".json")
+    if not path.is_file():
+        raise CheckpointError(f"{weights_path}: its card {path.name} is missing; both files belong together")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["format"] != FORMAT:
+            raise CheckpointError(f"{path}: expected format {FORMAT!r}, got {content['format']!r}")
+        return Card(ModelSpec(**content["model"]), content["read_out"], content["training"], content["sha256"])
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, CheckpointError):
+            raise
+        raise CheckpointError(f"{path}: not a card of a completion network: {error}") from error
+
+
+def load_checkpoint(path_or_name: str | Path) -> tuple[nn.Module, Card]:
+    """The network in evaluation mode on the CPU, and its card.
+
+    CheckpointError when the file was changed since its card was written, is damaged, or does not fit its network.
+    """
+    weights_path = find_weights(path_or_name)
+    card = read_card(weights_path)
+    content = weights_path.read_bytes()
+    found = hashlib.sha256(content).hexdigest()
+    if found != card.sha256:
+        raise CheckpointError(
+            f"{weights_path}: SHA-256 is {found[:12]}..., its card says {card.sha256[:12]}...; the file is damaged or not this card's"
+        )
+    try:
+        tensors = load_tensors(content)
+    except SafetensorError as error:
+        raise CheckpointError(f"{weights_path}: not a readable safetensors file: {error}") from error
+    with torch.random.fork_rng(devices=[]):
+        model = build_model(card.model)
+    fill(model, tensors, str(weights_path))
+    return model.eval(), card
+
+
+def fill(model: nn.Module, tensors: Mapping[str, Tensor], where: str) -> None:
+    """Copy tensors into the model in place. CheckpointError naming every missing, unknown or misshapen one."""
+    own = model.state_dict()
+    problems = [f"missing {name}" for name in own if name not in tensors]
+    problems += [f"unknown {name}" for name in tensors if name not in own]
+    problems += [
+        f"{name} is {tuple(tensors[name].shape)}, the network has {tuple(value.shape)}"
+        for name, value in own.items()
+        if name in tensors and tensors[name].shape != value.shape
+    ]
+    if problems:
+        shown = "; ".join(problems[:6]) + (f"; and {len(problems) - 6} more" if len(problems) > 6 else "")
+        raise CheckpointError(f"{where}: does not fit this network ({len(own)} tensors): {shown}")
+    model.load_state_dict(dict(tensors))

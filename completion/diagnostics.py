@@ -1,0 +1,83 @@
+"""Is a network alive? Its error with and without colour, and whether sigma separates the surfaces at depth edges."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from completion.analysis import mixed_share
+from completion.infer import Completer
+from completion.types import CompletedDepth, DepthFrame, FloatMap
+
+
+def edge_mask(target: FloatMap, window: int = 5) -> NDArray[np.bool_]:
+    """Pixels (H, W) whose valid target depths within `window` span more than 1 m and 10 %."""
+    kernel = np.ones((window, window), np.uint8)
+    largest = cv2.dilate(target, kernel)
+    smallest = cv2.erode(np.where(target > 0, target, np.float32(1e6)), kernel)
+    return (target > 0) & (largest - smallest > 1) & (largest > 1.1 * smallest)
+
+
+def sigma_statistics(completed: CompletedDepth, target: FloatMap, threshold: float = 1.0) -> dict[str, float]:
+    """Sigma at pixels of depth edges whose surfaces differ by more than `threshold` metres.
+
+    sigma_spread       standard deviation of sigma there: about 0 when the surfaces are never chosen between
+    sigma_correlation  with 'the foreground is nearer to the truth' (1 = perfect, 0 = none or undefined)
+    sigma_correct      share of pixels where sigma > 0.5 chooses the nearer surface
+    surfaces_apart     share of edge pixels with surfaces that differ that much
+    """
+    if completed.foreground is None or completed.background is None or completed.sigma is None:
+        return {}
+    edges = edge_mask(target)
+    apart = edges & (completed.background - completed.foreground > threshold)
+    share = float(apart.sum() / max(1, int(edges.sum())))
+    sigma = completed.sigma[apart].astype(np.float64)
+    near = np.abs(completed.foreground - target)[apart] < np.abs(completed.background - target)[apart]
+    if len(sigma) < 2:
+        return {"sigma_spread": 0.0, "sigma_correlation": 0.0, "sigma_correct": 0.0, "surfaces_apart": share}
+    spread = float(sigma.std())
+    correlation = float(np.corrcoef(sigma, near)[0, 1]) if spread > 0 and 0 < near.sum() < len(near) else 0.0
+    return {
+        "sigma_spread": spread,
+        "sigma_correlation": correlation,
+        "sigma_correct": float(((sigma > 0.5) == near).mean()),
+        "surfaces_apart": share,
+    }
+
+
+def _scores(completed: CompletedDepth, target: FloatMap) -> dict[str, float]:
+    valid = target > 0
+    error = np.abs(completed.depth - target)[valid] * 1000
+    edges = edge_mask(target)[valid]
+    return {
+        "mae_mm": float(error.mean()),
+        "tmae_mm": float(np.minimum(error, 1000).mean()),
+        "edge_tmae_mm": float(np.minimum(error[edges], 1000).mean()) if edges.any() else float("nan"),
+        "mixed_percent": 100 * mixed_share(completed.depth, target),
+    }
+
+
+def diagnose(completer: Completer, frames: Iterable[DepthFrame]) -> dict[str, float]:
+    """Mean over frames with a target: MAE, tMAE (t = 1 m), edge tMAE in mm, mixed pixels in %; the MAE and tMAE with a
+    grey image (`grey_...`, equal when colour is ignored); sigma's statistics. Frames without an edge drop out of the
+    means that need one. ValueError when no frame has a target.
+    """
+    rows: list[dict[str, float]] = []
+    for frame in frames:
+        if frame.target is None or not (frame.target > 0).any():
+            continue
+        completed = completer.complete(frame.sparse, frame.image, frame.K)
+        grey = completer.complete(frame.sparse, np.full_like(frame.image, 128), frame.K)
+        found = _scores(completed, frame.target) | sigma_statistics(completed, frame.target)
+        without = _scores(grey, frame.target)
+        rows.append(found | {f"grey_{name}": without[name] for name in ("mae_mm", "tmae_mm")})
+    if not rows:
+        raise ValueError("no frame with a target to diagnose on")
+    columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    return {
+        name: float(values[np.isfinite(values)].mean()) if np.isfinite(values).any() else float("nan")
+        for name, values in columns.items()
+    }

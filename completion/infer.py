@@ -1,0 +1,102 @@
+"""From one sparse map and one image to a completed depth: any image size, with or without weights.
+
+completer = load_completer("classical")
+completed = completer.complete(sparse, image)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from completion.checkpoints import load_checkpoint
+from completion.inputs import scale_rgb
+from completion.models import ModelSpec
+from completion.models.classical import ClassicalCompleter
+from completion.readout import read_output
+from completion.types import CompletedDepth, DepthFrame, FloatMap
+
+BACKENDS = ("torch",)
+
+
+class Completer(Protocol):
+    """Anything that completes depth."""
+
+    def complete(
+        self, sparse: FloatMap, image: NDArray[np.uint8], K: NDArray[np.float64] | None = None
+    ) -> CompletedDepth:
+        """Sparse (H, W) float32 metres (0 = none) and RGB (H, W, 3) uint8 -> dense maps of the same size."""
+        ...
+
+
+class NetworkCompleter:
+    """A network with its input scaling, on one device. Any image size: padded at the top and right, cut back after.
+
+    read_out  see `completion.readout`
+    rows      predict the bottom `rows` rows only (published protocols: 352, 256), 0 elsewhere; None: full height
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        spec: ModelSpec,
+        device: str | torch.device = "cpu",
+        read_out: str = "fused",
+        rows: int | None = None,
+    ) -> None:
+        self.device = torch.device(device)
+        self.model = model.to(self.device, memory_format=torch.channels_last).eval()
+        self.spec, self.read_out, self.rows = spec, read_out, rows
+
+    def complete(
+        self, sparse: FloatMap, image: NDArray[np.uint8], K: NDArray[np.float64] | None = None
+    ) -> CompletedDepth:
+        """One frame; see `Completer`. ValueError for maps that are no DepthFrame."""
+        return self.complete_batch([DepthFrame(image, sparse, None, K)])[0]
+
+    def complete_batch(self, frames: Sequence[DepthFrame]) -> list[CompletedDepth]:
+        """Several frames of one size in one pass. ValueError when sizes differ."""
+        if not frames:
+            return []
+        sizes = {frame.size for frame in frames}
+        if len(sizes) != 1:
+            raise ValueError(f"a batch must have one image size, got {sorted(sizes)}")
+        height, width = frames[0].size
+        top = 0 if self.rows is None else max(0, height - self.rows)
+        sparse = torch.from_numpy(np.stack([frame.sparse[top:] for frame in frames]))[:, None]
+        rgb = torch.from_numpy(np.stack([frame.image[top:] for frame in frames])).permute(0, 3, 1, 2)
+        with torch.inference_mode():
+            completed = self._run(sparse.to(self.device), rgb.to(self.device))
+        maps = [F.pad(part, (0, 0, top, 0)).cpu().numpy() if part is not None else None for part in completed]
+        return [CompletedDepth(*(part[i] if part is not None else None for part in maps)) for i in range(len(frames))]
+
+    def _run(self, sparse: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor | None, Tensor | None, Tensor | None]:
+        """(B, 1, h, w), (B, 3, h, w) uint8 -> depth, foreground, background, sigma, each (B, h, w) or None."""
+        height, width = sparse.shape[-2:]
+        multiple = self.spec.multiple_of
+        padding = (0, -width % multiple, -height % multiple, 0)
+        colours = F.pad(scale_rgb(rgb, self.spec.rgb), padding, mode="replicate")
+        scaled = F.pad(sparse, padding) / self.spec.depth_unit
+        outputs = self.model(scaled, colours.contiguous(memory_format=torch.channels_last))
+        full = outputs[0] if isinstance(outputs, tuple) else outputs
+        return read_output(full[:, :, padding[2] :, :width], self.spec, self.read_out)
+
+
+def load_completer(path_or_name: str | Path, device: str = "cpu", backend: str = "torch") -> Completer:
+    """The completer of a weights file, of an embedded name, or "classical" (no weights).
+
+    ValueError for an unknown backend, `checkpoints.CheckpointError` for weights that cannot be used.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, got {backend!r}")
+    if str(path_or_name) == "classical":
+        return ClassicalCompleter()
+    model, card = load_checkpoint(path_or_name)
+    return NetworkCompleter(model, card.model, device, card.read_out)

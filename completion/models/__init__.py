@@ -1,0 +1,84 @@
+"""The networks by name. Each entry says how its inputs are scaled and what comes out; see the builders themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from torch import nn
+
+from completion.models.guided import Guided
+from completion.models.hourglass import MultiStack, Twise
+
+RGB_SCALINGS = ("unit", "standardised", "raw")
+OUTPUTS = ("twin", "depth", "coefficients")
+
+
+@dataclass(frozen=True)
+class ModelSpec:
+    """Everything needed to rebuild a network and feed it.
+
+    architecture  key of `MODELS`
+    arguments     keyword arguments of its builder
+    depth_unit    metres per unit of the network's depth, in and out (80 for TWISE)
+    rgb           "unit": / 255; "standardised": ImageNet mean and deviation; "raw": 0..255
+    output        "twin": foreground, background, sigma logit; "depth": one channel; "coefficients": logits per bin
+    multiple_of   height and width must be multiples of this
+    """
+
+    architecture: str
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+    depth_unit: float = 1.0
+    rgb: str = "unit"
+    output: str = "depth"
+    multiple_of: int = 16
+
+    def __post_init__(self) -> None:
+        if self.architecture not in MODELS:
+            raise ValueError(f"architecture: expected one of {', '.join(sorted(MODELS))}, got {self.architecture!r}")
+        if self.rgb not in RGB_SCALINGS:
+            raise ValueError(f"rgb: expected one of {', '.join(RGB_SCALINGS)}, got {self.rgb!r}")
+        if self.output not in OUTPUTS:
+            raise ValueError(f"output: expected one of {', '.join(OUTPUTS)}, got {self.output!r}")
+        if not self.depth_unit > 0:
+            raise ValueError(f"depth_unit: expected metres > 0, got {self.depth_unit}")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A builder and the inputs it was designed for."""
+
+    builder: Callable[..., nn.Module]
+    depth_unit: float
+    rgb: str
+    output: str
+    multiple_of: int
+
+
+MODELS: dict[str, Entry] = {
+    "twise": Entry(Twise, 80.0, "unit", "twin", 16),
+    "msg_chn": Entry(MultiStack, 1.0, "unit", "depth", 16),
+    "guided": Entry(Guided, 1.0, "standardised", "twin", 64),
+}
+
+
+def default_spec(architecture: str, **arguments: Any) -> ModelSpec:
+    """The published input scaling of `architecture` with these builder arguments. ValueError for an unknown name."""
+    if architecture not in MODELS:
+        raise ValueError(f"architecture: expected one of {', '.join(sorted(MODELS))}, got {architecture!r}")
+    entry = MODELS[architecture]
+    return ModelSpec(architecture, arguments, entry.depth_unit, entry.rgb, entry.output, entry.multiple_of)
+
+
+def with_rgb(spec: ModelSpec, rgb: str) -> ModelSpec:
+    """The same network fed with another colour scaling."""
+    return replace(spec, rgb=rgb)
+
+
+def build_model(spec: ModelSpec) -> nn.Module:
+    """A freshly initialised network (torch's global generator). ValueError for arguments its builder does not take."""
+    try:
+        return MODELS[spec.architecture].builder(**spec.arguments)
+    except TypeError as error:
+        raise ValueError(f"{spec.architecture}: cannot be built with {dict(spec.arguments)}: {error}") from error

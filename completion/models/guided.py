@@ -1,0 +1,126 @@
+"""The embedded network: two surfaces, each a learned selection among measured samples near the pixel.
+
+TWISE regresses its surfaces, which needs long training before they leave the mean of an edge. Here a compact U-Net
+weighs candidates instead (`candidates.py`): the foreground prefers near candidates, the background far ones, and sigma
+chooses. A surface is a convex combination of samples in inverse depth (exact on planes) whose small weights are cut to
+zero, so that a depth between two objects, measured by nothing, cannot arise from a small leak. Untrained, the network
+is roughly linear interpolation in inverse depth with a foreground and a background reading of every edge.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from completion.models.blocks import initialise, require_multiple
+from completion.models.candidates import Candidates, candidate_count, find_candidates
+
+LOG_10M = math.log(10.0)
+
+
+def _block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1), nn.ReLU())
+
+
+class Residual(nn.Module):
+    """Two 3x3 convolutions round an identity."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(x + self.conv2(F.relu(self.conv1(x))))
+
+
+class CompactUNet(nn.Module):
+    """(B, inputs, H, W) -> (B, outputs, H, W); works at 1/2 to 1/32 and returns to full size by pixel shuffle."""
+
+    def __init__(self, inputs: int, outputs: int, width: int) -> None:
+        super().__init__()
+        widths = (width, width * 3 // 2, width * 2, width * 3, width * 3)
+        self.stem = nn.Sequential(_block(inputs * 4, width), Residual(width))
+        self.down = nn.ModuleList(
+            nn.Sequential(_block(a, b, stride=2), Residual(b)) for a, b in zip(widths[:-1], widths[1:])
+        )
+        self.lift = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(widths[:-1], widths[1:]))
+        self.up = nn.ModuleList(_block(a, a) for a in widths[:-1])
+        self.head = nn.Conv2d(width, outputs * 4, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        features = [self.stem(F.pixel_unshuffle(x, 2))]
+        for down in self.down:
+            features.append(down(features[-1]))
+        x = features.pop()
+        for lift, up in zip(reversed(self.lift), reversed(self.up)):
+            x = up(features.pop() + F.interpolate(lift(x), scale_factor=2, mode="nearest"))
+        return F.pixel_shuffle(self.head(x), 2)
+
+
+class Guided(nn.Module):
+    """`forward(sparse in metres, rgb) -> (out,)`, out (B, 3, H, W): foreground and background in metres, sigma logit.
+
+    Foreground <= background everywhere. H and W must be multiples of 64. Without any sample the depth comes from the
+    image alone (a candidate the network draws itself).
+
+    width     features at half resolution
+    residual  largest relative correction of a surface (0.05: 5 %)
+    tilt      initial exponent of the preference for near or far candidates
+    cut       weights below this share of 1 become 0
+    """
+
+    def __init__(
+        self, width: int = 24, residual: float = 0.03, tilt: float = 1.5, cut: float = 0.02, init: str = "he"
+    ) -> None:
+        super().__init__()
+        self.candidates = candidate_count() + 1  # and one drawn from the image
+        if not 0 <= cut < 1 / self.candidates:
+            raise ValueError(f"cut: expected a value in [0, {1 / self.candidates:.3f}), got {cut}")
+        self.residual, self.cut = residual, cut
+        self.tilt_bias = math.log(math.expm1(tilt))
+        # 2 sets of candidate logits, 2 tilts, 2 residuals, own candidate's log depth, sigma
+        self.network = CompactUNet(14, 2 * self.candidates + 6, width)
+        initialise(self, init)
+        with torch.no_grad():
+            self.network.head.weight.mul_(0.01)
+
+    def forward(self, sparse: Tensor, rgb: Tensor) -> tuple[Tensor]:
+        require_multiple(sparse, rgb, 64)
+        found = find_candidates(sparse)
+        raw = self.network(torch.cat((rgb, self._depth_features(sparse, found)), 1))
+        return (self._assemble(found, raw.float()),)
+
+    @staticmethod
+    def _depth_features(sparse: Tensor, found: Candidates) -> Tensor:
+        """(B, 11, H, W): log depths and distances of the rings above and below, the sample itself, the image row."""
+        rows = [0, 1, found.count - 2, found.count - 1]  # up, down, second up, second down
+        log_depth = found.log_depth[:, rows] - LOG_10M
+        nearness = torch.exp(found.prior[:, rows[:2]].clamp(min=-6.0))
+        missing = (found.prior[:, rows[:2]] < -20).to(sparse.dtype)
+        measured = (sparse > 0).to(sparse.dtype)
+        gap = log_depth[:, :1] - log_depth[:, 1:2]
+        height = torch.linspace(-1, 1, sparse.shape[2], device=sparse.device, dtype=sparse.dtype)
+        row = height.view(1, 1, -1, 1).expand_as(sparse)
+        return torch.cat((log_depth, nearness, missing, measured, gap, row), 1)
+
+    def _assemble(self, found: Candidates, raw: Tensor) -> Tensor:
+        """Candidates (B, K, H, W) and raw outputs (B, 2(K+1)+6, H, W) -> (B, 3, H, W)."""
+        near_logits, far_logits, rest = raw.split((self.candidates, self.candidates, 6), 1)
+        own = 0.3 + 2.3 * torch.tanh(rest[:, 4:5] / 2.3) + LOG_10M  # 1.4 to 135 m, at first about 13 m
+        log_depth = torch.cat((found.log_depth, own), 1)
+        prior = torch.cat((found.prior, torch.full_like(own, -5.0)), 1)
+        tilt = F.softplus(rest[:, 0:2] + self.tilt_bias)
+        inverse = torch.exp(-log_depth)
+        near = self._surface(prior + near_logits - tilt[:, 0:1] * log_depth, inverse, rest[:, 2:3])
+        far = self._surface(prior + far_logits + tilt[:, 1:2] * log_depth, inverse, rest[:, 3:4])
+        return torch.cat((torch.minimum(near, far), torch.maximum(near, far), rest[:, 5:6]), 1)
+
+    def _surface(self, logits: Tensor, inverse: Tensor, correction: Tensor) -> Tensor:
+        """Depth (B, 1, H, W) in metres: convex combination in inverse depth without small weights, times 1 +- residual."""
+        weights = F.relu(torch.softmax(logits, 1) - self.cut)
+        mixed = (weights * inverse).sum(1, keepdim=True) / weights.sum(1, keepdim=True)
+        return (1 + self.residual * torch.tanh(correction)) / mixed

@@ -1,0 +1,140 @@
+"""The training loss of a network's outputs, for every kind of network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from completion import losses
+from completion.models import ModelSpec
+
+OBJECTIVES = ("twin", "l1", "l2", "l1_l2", "huber", "dc")
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What is minimised. The defaults are the published TWISE; everything after `target_pooling` is ours.
+
+    kind             "twin", "l1", "l2", "l1_l2", "huber" or "dc" (cross-entropy of Depth Coefficients)
+    gamma            asymmetry of the twin-surface loss
+    detach_surfaces  the fusion term trains sigma alone
+    target_pooling   reduction of the target for outputs of lower resolution (`losses.POOLING_RULES`)
+    sigma_weight     weight of the auxiliary cross-entropy on sigma at the first and the last step, linear between
+    sigma_threshold  metres between the surfaces from which a pixel counts as ambiguous there
+    edge_weight      extra weight of pixels at depth edges of the target (0: none; 4: five times)
+    relative_weight  share of a pixel's weight that falls with distance beyond 10 m (1: as 10 m / distance)
+    below_top_ring   no loss above the topmost measured ring
+    auxiliary        weight of further outputs of a "dc" network (published: 0.8)
+    """
+
+    kind: str = "twin"
+    gamma: float = 2.0
+    detach_surfaces: bool = False
+    target_pooling: str = "average"
+    sigma_weight: tuple[float, float] = (0.0, 0.0)
+    sigma_threshold: float = 1.0
+    edge_weight: float = 0.0
+    relative_weight: float = 0.0
+    below_top_ring: bool = False
+    auxiliary: float = 0.8
+
+    def __post_init__(self) -> None:
+        if self.kind not in OBJECTIVES:
+            raise ValueError(f"objective: expected one of {', '.join(OBJECTIVES)}, got {self.kind!r}")
+        if self.gamma < 1:
+            raise ValueError(f"gamma: expected >= 1, got {self.gamma}")
+        if self.target_pooling not in losses.POOLING_RULES:
+            raise ValueError(
+                f"target_pooling: expected one of {', '.join(losses.POOLING_RULES)}, got {self.target_pooling!r}"
+            )
+
+
+def fits(objective: Objective, spec: ModelSpec) -> None:
+    """ValueError when a network with this output cannot be trained by this objective."""
+    needed = {"twin": "twin", "dc": "coefficients"}.get(objective.kind, "depth")
+    if spec.output != needed:
+        raise ValueError(
+            f"objective {objective.kind!r} needs a network with output {needed!r}, {spec.architecture} gives {spec.output!r}"
+        )
+
+
+def pixel_weights(sparse: Tensor, target: Tensor, objective: Objective) -> Tensor:
+    """Weight of every pixel of the target (B, 1, H, W), metres; 0 where it has no value."""
+    weights = losses.valid_weights(target)
+    if objective.below_top_ring:
+        weights = weights * losses.below_top_ring(sparse)
+    if objective.edge_weight:
+        weights = weights * (1 + objective.edge_weight * losses.depth_edges(target))
+    if objective.relative_weight:
+        nearness = (10.0 / target.clamp(min=1e-3)).clamp(max=1.0)
+        weights = weights * (1 - objective.relative_weight * (1 - nearness))
+    return weights
+
+
+def training_loss(
+    outputs: tuple[Tensor, ...],
+    sparse: Tensor,
+    target: Tensor,
+    spec: ModelSpec,
+    objective: Objective,
+    scale_weights: tuple[float, ...],
+    progress: float,
+) -> dict[str, Tensor]:
+    """Loss parts by name, scalars; "loss" is what is minimised.
+
+    outputs        finest first; sparse and target (B, 1, H, W) in metres
+    scale_weights  one per output, as far as given (outputs beyond count 0)
+    progress       share of the training done, in [0, 1]
+    """
+    weights = pixel_weights(sparse, target, objective)
+    if objective.kind == "dc":
+        return _coefficient_parts(outputs, target, weights, objective)
+    parts: dict[str, Tensor] = {}
+    total = torch.zeros((), device=target.device)
+    for number, (output, scale_weight) in enumerate(zip(outputs, scale_weights)):
+        if scale_weight == 0:
+            continue
+        factor = target.shape[-1] // output.shape[-1]
+        scaled = losses.pool_target(target, factor, objective.target_pooling)
+        scale_pixels = losses.pool_target(weights, factor, "maximum") * losses.valid_weights(scaled)
+        found = _parts(output.float(), scaled / spec.depth_unit, scale_pixels, spec, objective, progress)
+        total = total + scale_weight * found["loss"]
+        parts |= found if number == 0 else {f"loss_{number}": found["loss"]}
+    return parts | {"loss": total}
+
+
+def _parts(
+    output: Tensor, target: Tensor, weights: Tensor, spec: ModelSpec, objective: Objective, progress: float
+) -> dict[str, Tensor]:
+    """Loss parts of one output; target in the network's unit."""
+    if objective.kind != "twin":
+        return {"loss": losses.DEPTH_LOSSES[objective.kind](output, target, weights)}
+    twin = losses.twin_loss(output, target, weights, objective.gamma, objective.detach_surfaces)
+    parts = {"foreground": twin.foreground, "background": twin.background, "fusion": twin.fusion}
+    total = twin.total
+    first, last = objective.sigma_weight
+    if first or last:
+        parts["sigma"] = losses.sigma_loss(output, target, weights, objective.sigma_threshold / spec.depth_unit)
+        # In the unit of the network's loss: the twin terms are metres / depth_unit.
+        total = total + (first + (last - first) * progress) / spec.depth_unit * parts["sigma"]
+    return parts | {"loss": total}
+
+
+def _coefficient_parts(
+    outputs: tuple[Tensor, ...], target: Tensor, weights: Tensor, objective: Objective
+) -> dict[str, Tensor]:
+    """Cross-entropy at full resolution, and of further outputs against the target's first valid pixel per block."""
+    from completion.depth_coefficients import cross_entropy
+
+    main = cross_entropy(outputs[0].float(), target, weights)
+    parts, total = {"entropy": main}, main
+    for number, output in enumerate(outputs[1:], start=1):
+        size = output.shape[-2:]
+        small = F.interpolate(target, size=size, mode="nearest")
+        found = cross_entropy(output.float(), small, losses.valid_weights(small))
+        parts[f"entropy_{number}"] = found
+        total = total + objective.auxiliary * found
+    return parts | {"loss": total}
