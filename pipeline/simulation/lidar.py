@@ -1,0 +1,165 @@
+"""Rotating multi-beam LiDAR: where its beams go and what comes back.
+
+The HDL-64E has two blocks of 32 lasers (upper +2 to -8.33 degrees in steps of 1/3, lower -8.83 to -24.33 in steps of
+1/2) and turns at 10 Hz with a firing every 0.1728 degrees (Velodyne HDL-64E manual). KITTI's files list ring after ring
+from the top, each counter-clockwise from the forward direction, up to 80 m.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.simulation.tracing import Tracer
+
+AZIMUTH_STEP = 0.1728
+MIN_RANGE, MAX_RANGE = 1.45, 80.0
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Beam pattern and noise.
+
+    elevations   (B,) degrees, top first
+    azimuth_step degrees between firings
+    range_noise  standard deviation of one range in metres; ring_bias: of the error a laser keeps for a whole scan
+    loss         probability that a good pulse is lost
+    """
+
+    elevations: NDArray[np.float64]
+    azimuth_step: float = AZIMUTH_STEP
+    range_noise: float = 0.016
+    ring_bias: float = 0.012
+    loss: float = 0.01
+
+
+def _hdl64e() -> NDArray[np.float64]:
+    nominal = np.concatenate([np.linspace(2.0, -8.33, 32), np.linspace(-8.83, -24.33, 32)])
+    # Lasers sit up to a few hundredths of a degree off their nominal angle; the order never changes.
+    return np.asarray(nominal + 0.05 * np.sin(2.39996 * np.arange(64)))
+
+
+def sensor(rows: int) -> Sensor:
+    """The sensor with 64 (HDL-64E), 32 (HDL-32E), 16 (VLP-16) or 8 rows. Raises ValueError for other counts."""
+    patterns = {
+        64: _hdl64e(),
+        32: np.linspace(10.67, -30.67, 32),
+        16: np.linspace(15.0, -15.0, 16),
+        8: np.linspace(3.2, -19.2, 8),
+    }
+    if rows not in patterns:
+        raise ValueError(f"rows: expected one of {sorted(patterns)}, got {rows}")
+    return Sensor(patterns[rows])
+
+
+def beam_directions(sensor: Sensor, rng: np.random.Generator) -> tuple[NDArray[np.float64], tuple[int, int]]:
+    """((B*A, 3) unit directions in the LiDAR frame, (B, A)); rings start just left of forward, each at its own phase."""
+    count = int(360.0 / sensor.azimuth_step)
+    rings = len(sensor.elevations)
+    phase = rng.uniform(0.02, 0.98, rings) * sensor.azimuth_step
+    azimuth = np.radians(phase[:, None] + np.arange(count) * sensor.azimuth_step)
+    elevation = np.radians(sensor.elevations)[:, None]
+    directions = np.stack(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation) * np.ones_like(azimuth),
+        ],
+        axis=-1,
+    )
+    return directions.reshape(-1, 3), (rings, count)
+
+
+def scan(
+    tracer: Tracer, sensor: Sensor, T_world_velo: NDArray[np.float64], rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """(N, 4) float32 x y z intensity in the LiDAR frame, ring after ring from the top.
+
+    Pulses pass through glass with its transmission, are lost by distance, incidence and material, mix at edges, and
+    carry range noise.
+    """
+    directions, grid = beam_directions(sensor, rng)
+    reach, reflectance, cosine = _first_returns(tracer, directions @ T_world_velo[:3, :3].T, T_world_velo[:3, 3], rng)
+    power = _power(reach, reflectance, cosine)
+    reach = _mixed(reach.reshape(grid), rng).ravel()
+    returned = _detected(power, rng) & (rng.random(len(reach)) > sensor.loss)
+    ring = np.repeat(np.arange(grid[0]), grid[1])
+    reach = reach + rng.normal(0, sensor.ring_bias, grid[0])[ring] + rng.normal(0, sensor.range_noise, len(reach))
+    returned &= np.isfinite(reach) & (reach > MIN_RANGE) & (reach < MAX_RANGE)
+    points = directions[returned] * reach[returned, None]
+    echo = intensity(reflectance[returned], cosine[returned], reach[returned], rng)
+    # KITTI's files hold millimetres and hundredths.
+    return np.column_stack([np.round(points, 3), echo]).astype(np.float32)
+
+
+def _first_returns(
+    tracer: Tracer, rays: NDArray[np.float64], origin: NDArray[np.float64], rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """(range in metres or inf, reflectance, cosine of incidence) per ray; up to four panes are passed."""
+    table = tracer.table
+    total = np.zeros(len(rays))
+    reflectance, cosine = np.zeros(len(rays)), np.zeros(len(rays))
+    active = np.arange(len(rays))
+    through = np.ones(len(rays))
+    reach = np.full(len(rays), np.inf)
+    for _ in range(5):
+        start = origin + rays[active] * total[active, None]
+        hits = tracer.cast(start, rays[active])
+        hit = hits.primitive >= 0
+        active, primitive, normal = active[hit], hits.primitive[hit], hits.normal[hit]
+        total[active] += hits.reach[hit]
+        surface = tracer.surface_of(primitive)
+        angle = np.abs(np.einsum("ij,ij->i", normal, rays[active]))
+        passed = rng.random(len(active)) < table.transmission[surface] * np.minimum(1.0, 2.0 * angle)
+        stopped = active[~passed]
+        reach[stopped] = total[stopped]
+        reflectance[stopped] = table.reflectance[surface[~passed]] * through[stopped]
+        cosine[stopped] = angle[~passed]
+        lost = stopped[rng.random(len(stopped)) < table.dropout[surface[~passed]]]
+        reach[lost] = np.inf
+        active = active[passed]
+        through[active] *= 0.75
+        total[active] += 2e-3
+        if not len(active):
+            break
+    return reach, reflectance, cosine
+
+
+def _power(
+    reach: NDArray[np.float64], reflectance: NDArray[np.float64], cosine: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Received power relative to a 10 % target facing the sensor at 50 m (the HDL-64E's stated range for it).
+
+    The root of the cosine stands for rough surfaces, which return more at grazing angles than Lambert's law says.
+    """
+    distance = np.where(np.isfinite(reach), np.maximum(reach, 1.0), np.inf)
+    return np.asarray(reflectance * np.sqrt(cosine) / 0.1 * (50.0 / distance) ** 2)
+
+
+def _detected(power: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.bool_]:
+    """A pulse is detected with a probability that falls from 1 to 0 around relative power 0.5."""
+    with np.errstate(divide="ignore"):
+        chance = 1 / (1 + np.exp(-np.clip(3.0 * np.log(power / 0.5), -50, 50)))
+    return np.asarray(rng.random(len(power)) < chance)
+
+
+def _mixed(reach: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """Beams that touch two surfaces less than 4 m apart now and then report a range in between."""
+    mixed = reach.copy()
+    with np.errstate(invalid="ignore"):
+        step = np.abs(reach - np.roll(reach, -1, axis=1))
+    edge = np.isfinite(step) & (step > 0.4) & (step < 4.0) & (rng.random(reach.shape) < 0.08)
+    share = rng.random(reach.shape)
+    mixed[edge] = (share * reach + (1 - share) * np.roll(reach, -1, axis=1))[edge]
+    return mixed
+
+
+def intensity(
+    reflectance: NDArray[np.float64], cosine: NDArray[np.float64], reach: NDArray[np.float64], rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """KITTI-like intensity in [0, 0.99], steps of 0.01: reflectance with a weak fall over angle and distance, speckled."""
+    fall = cosine**0.25 * np.clip(1.15 - reach / 90.0, 0.3, 1.0)
+    speckle = rng.normal(1.0, 0.18, len(reach))
+    return np.asarray(np.round(np.clip(1.05 * reflectance * fall * speckle - 0.02, 0, 0.99), 2))
