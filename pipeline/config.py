@@ -39,9 +39,9 @@ class LibrarySection(BaseModel):
 class DataConfig(Section):
     """Where frames come from."""
 
-    name: str = Field("synthetic", description="kitti_object, kitti_depth, ... or synthetic (made by the synth stage)")
-    root: str | None = Field(None, description="folder of the data set; synthetic data defaults to OUT/data")
-    frames: str | None = Field(None, description="a:b (positions), a split file, or ids separated by commas")
+    name: str = Field(default="synthetic", description="kitti_object, ..., or synthetic (made by the synth stage)")
+    root: str | None = Field(default=None, description="folder of the data set; synthetic data defaults to OUT/data")
+    frames: str | None = Field(default=None, description="a:b (positions), a split file, or ids separated by commas")
 
 
 class SynthConfig(LibrarySection):
@@ -51,7 +51,7 @@ class SynthConfig(LibrarySection):
 class CompletionConfig(Section):
     """Depth completion."""
 
-    model: str = Field("classical", description="embedded weights by name, a checkpoint file, or 'classical'")
+    model: str = Field(default="classical", description="embedded weights by name, a checkpoint file, or 'classical'")
     backend: str = "torch"
     device: str = "cpu"
 
@@ -59,15 +59,17 @@ class CompletionConfig(Section):
 class AugmentConfig(LibrarySection):
     """The point-cloud stage; other keys change fields of the preset (`pipeline.pointcloud.presets`)."""
 
-    preset: str = Field("L_D_F", description="L, D, D_F, D_SF, L_D_SF, L_D_SF_mask, ...")
-    semantics: str | None = Field(None, description="where object masks come from; 'dataset' = the frame's own")
-    depth_from: str | None = Field(None, description="folder of uint16 depth PNGs (ID.png) used instead of completion")
+    preset: str = Field(default="L_D_F", description="L, D, D_F, D_SF, L_D_SF, L_D_SF_mask, ...")
+    semantics: str | None = Field(default=None, description="object masks; 'dataset' = the frame's own")
+    depth_from: str | None = Field(
+        default=None, description="folder of uint16 depth PNGs (ID.png) used instead of completion"
+    )
 
 
 class DetectionConfig(Section):
     """The 3D detector."""
 
-    model: str = Field("auto", description="embedded weights by name, a checkpoint file, or 'auto' (by preset)")
+    model: str = Field(default="auto", description="embedded weights by name, a checkpoint file, or 'auto' (by preset)")
     device: str = "cpu"
 
 
@@ -82,7 +84,7 @@ class EvaluationConfig(Section):
 class ReportConfig(Section):
     """The HTML report."""
 
-    frames: int = Field(20, ge=1, le=500, description="frames shown in detail")
+    frames: int = Field(default=20, ge=1, le=500, description="frames shown in detail")
 
 
 class TrainConfig(LibrarySection):
@@ -94,16 +96,16 @@ class TrainConfig(LibrarySection):
 class RunConfig(Section):
     """How the work is done; nothing here changes a result."""
 
-    workers: int = Field(0, ge=0, le=1024, description="processes; 0 = one per core")
-    keep_free_gb: float = Field(0.5, ge=0, description="stop before the disk has less than this left")
-    max_gb: float | None = Field(None, gt=0, description="stop when this run's files exceed this")
-    keep_going: bool = Field(True, description="process the other frames when one fails")
+    workers: int = Field(default=0, ge=0, le=1024, description="processes; 0 = one per core")
+    keep_free_gb: float = Field(default=0.5, ge=0, description="stop before the disk has less than this left")
+    max_gb: float | None = Field(default=None, gt=0, description="stop when this run's files exceed this")
+    keep_going: bool = Field(default=True, description="process the other frames when one fails")
 
 
 class Config(Section):
     """A whole run."""
 
-    seed: int = Field(1, ge=0, lt=2**31)
+    seed: int = Field(default=1, ge=0, lt=2**31)
     data: DataConfig = DataConfig()
     synth: SynthConfig = SynthConfig()
     completion: CompletionConfig = CompletionConfig()
@@ -113,7 +115,9 @@ class Config(Section):
     report: ReportConfig = ReportConfig()
     train: TrainConfig = TrainConfig()
     run: RunConfig = RunConfig()
-    made_with: dict[str, str | None] | None = Field(None, description="written by the program: versions, git commit")
+    made_with: dict[str, str | None] | None = Field(
+        default=None, description="versions and git commit, written by the program"
+    )
 
 
 def load_config(source: str | Path | None, overrides: Iterable[str] = ()) -> Config:

@@ -82,7 +82,7 @@ def image_size(path: str | Path) -> tuple[int, int]:
 
 
 def check_complete(data: bytes, path: Path) -> None:
-    """Raises DataError unless `data` is a whole PNG (every chunk, checksums, IEND) or JPEG (end marker) of sane size."""
+    """Raises DataError unless `data` is a whole PNG (chunks, checksums, IEND) or JPEG (end marker) of sane size."""
     if data.startswith(PNG_SIGNATURE):
         _png_size(data, path)
         kinds = [kind for kind, _ in _png_chunks(data, path)]

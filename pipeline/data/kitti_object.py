@@ -15,9 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from detection.boxes import observation_angle, project_to_image
 from detection.kitti_format import KittiObject, format_line, parse_lines
-from detection.types import Detections
 from pipeline.data.calibration import Calibration, format_calibration, read_calibration
 from pipeline.data.dataset import Dataset
 from pipeline.data.depth_png import png_bytes, read_depth_png, write_depth_png
@@ -193,38 +191,3 @@ def write_objects(path: Path, objects: Iterable[KittiObject]) -> None:
 def write_split(root: Path, name: str, frame_ids: Iterable[str]) -> None:
     """ROOT/ImageSets/NAME.txt, one id a line."""
     write_text(root / "ImageSets" / f"{name}.txt", "".join(f"{frame_id}\n" for frame_id in frame_ids))
-
-
-def result_objects(detections: Detections, P2: NDArray[np.float64], image_size: tuple[int, int]) -> list[KittiObject]:
-    """Detections as KITTI result lines, best first: projected and clipped 2D box, observation angle, score.
-
-    P2          (3, 4) rectified camera 0 -> pixels
-    image_size  (height, width) in pixels
-    Boxes whose projection lies outside the image are left out, as the benchmark expects; truncated and occluded are -1.
-    """
-    rectangles = project_to_image(detections.boxes, P2, image_size)
-    alphas = observation_angle(detections.boxes)
-    visible = (rectangles[:, 2] > rectangles[:, 0]) & (rectangles[:, 3] > rectangles[:, 1])
-    visible &= detections.boxes.values[:, 2] > 0
-    order = np.argsort(-detections.scores, kind="stable")
-    return [
-        _result_object(detections, int(index), rectangles[index], float(alphas[index]))
-        for index in order
-        if visible[index]
-    ]
-
-
-def _result_object(detections: Detections, index: int, rectangle: NDArray[np.float64], alpha: float) -> KittiObject:
-    x, y, z, h, w, l, ry = (float(value) for value in detections.boxes.values[index])
-    x1, y1, x2, y2 = (float(value) for value in rectangle)
-    return KittiObject(
-        type=detections.classes[index],
-        truncated=-1,
-        occluded=-1,
-        alpha=alpha,
-        bbox=(x1, y1, x2, y2),
-        size=(h, w, l),
-        location=(x, y, z),
-        ry=ry,
-        score=float(detections.scores[index]),
-    )

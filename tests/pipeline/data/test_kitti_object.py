@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from detection.kitti_format import KittiObject
-from detection.types import Boxes3D, Detections
 from pipeline.data import open_dataset
 from pipeline.data.calibration import Calibration
 from pipeline.data.frame import Frame
-from pipeline.data.kitti_object import read_labels, read_velodyne, result_objects, write_frame, write_velodyne
+from pipeline.data.kitti_object import read_labels, read_velodyne, write_frame, write_objects, write_velodyne
 from pipeline.errors import DataError, MissingPart, UsageError
 
 P2 = np.array([[100.0, 0, 40, 3], [0, 100, 20, 0.5], [0, 0, 1, 0.003]])
@@ -87,7 +87,7 @@ def test_jpeg_images_are_found(root: Path) -> None:
 
 
 def test_no_such_folder_and_no_frames(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no such folder: .*nowhere"):
+    with pytest.raises(UsageError, match=r"no such folder: .*nowhere"):
         open_dataset("kitti_object", tmp_path / "nowhere")
     with pytest.raises(UsageError, match="expected training/"):
         open_dataset("kitti_object", tmp_path)
@@ -211,26 +211,8 @@ def test_a_frame_without_label_says_so(root: Path) -> None:
         _ = frame.labels
 
 
-def test_results_are_projected_clipped_and_sorted() -> None:
-    # A 2 m cube centred 10 m in front: x -1..1, y 0..2 (bottom at y = 2), nearest face at z = 9.
-    boxes = Boxes3D(np.array([[0, 2, 10, 2, 2, 2, 0], [0, 2, 10, 2, 2, 2, 0.5], [500, 2, 10, 2, 2, 2, 0]]))
-    detections = Detections(boxes, ("Car", "Van", "Car"), np.array([0.2, 0.9, 0.5]))
-    camera = np.array([[90.0, 0, 50, 0], [0, 90, 20, 0], [0, 0, 1, 0]])
-    objects = result_objects(detections, camera, (60, 100))
-    assert [item.type for item in objects] == ["Van", "Car"]  # best first; the box far to the side is left out
-    car = objects[1]
-    assert car.bbox == pytest.approx((40.0, 20.0, 60.0, 40.0))
-    assert (car.truncated, car.occluded, car.score) == (-1, -1, 0.2)
-    assert car.alpha == pytest.approx(0.0)
-    assert car.location == (0, 2, 10)
-
-
 def test_result_files_are_read_back_with_scores(tmp_path: Path) -> None:
-    from pipeline.data.kitti_object import write_objects
-
-    detections = Detections(Boxes3D(np.array([[0, 2, 10, 2, 2, 2, 0.0]])), ("Car",), np.array([0.25]))
-    objects = result_objects(detections, P2, (40, 80))
-    write_objects(tmp_path / "a.txt", objects)
+    write_objects(tmp_path / "a.txt", [replace(CAR, score=0.25)])
     (read,) = read_labels(tmp_path / "a.txt", scored=True)
     assert read.score == 0.25
     with pytest.raises(DataError, match="expected 15 columns, got 16"):

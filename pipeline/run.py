@@ -1,0 +1,198 @@
+"""A request carried out: make or open the data, run the stages it needs, score, report, say how it went."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pipeline.config import Config, dump_config, load_config
+from pipeline.errors import UsageError
+from pipeline.paths import RunFolder
+from pipeline.runner.atomic import remove_leftovers, write_text
+from pipeline.runner.batch import Batch, StageSummary, open_batch
+from pipeline.runner.failures import update_failures
+from pipeline.runner.jobs import Outcome, Task
+from pipeline.runner.processes import available_cores
+from pipeline.runner.signals import StopRequest, stop_on_signals
+from pipeline.stages import STAGES, data_root, frame_stages_for
+from pipeline.summary import print_dry_run, print_results, print_summary
+from pipeline.versions import made_with
+
+DONE, SOME_FAILED, REFUSED = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the command line asks for.
+
+    stage      one of STAGES, or None for everything but training
+    overrides  `key.sub=value` texts, applied after the file and the other options
+    shard      (i, n), counted from 0
+    command    the command line, for messages and failures.json
+    """
+
+    stage: str | None = None
+    config: str | None = None
+    out: str | None = None
+    overrides: tuple[str, ...] = ()
+    shard: tuple[int, int] | None = None
+    engine: str = "local"
+    dry_run: bool = False
+    command: tuple[str, ...] = field(default=("run_pipeline",))
+
+
+def carry_out(request: Request) -> int:
+    """Runs the stages of a request. Returns the exit code; raises UsageError when it cannot be carried out."""
+    out = Path(request.out) if request.out else default_out(request.config)
+    config = load_config(config_source(request, out), request.overrides)
+    run = RunFolder(out)
+    stage = request.stage or "report"
+    check_request(request, config, stage)
+    if request.dry_run:
+        return dry_run(config, run, stage, request.shard)
+    prepare_folder(run, config)
+    make_data(config, run, stage, request.shard)
+    if stage == "synth":
+        print(f"synthetic data: {data_root(config, run)}")
+        return DONE
+    if stage == "train":
+        from pipeline.training import train_stage
+
+        return train_stage(config, run)
+    with stop_on_signals() as stop:
+        return run_batch(request, config, run, stage, stop)
+
+
+def default_out(config: str | None) -> Path:
+    """runs/demo, or runs/NAME after the configuration file."""
+    return Path("runs") / ("demo" if config is None else Path(config).stem)
+
+
+def config_source(request: Request, out: Path) -> str | Path | None:
+    """The file asked for, else the run's own resolved configuration, else the demo's."""
+    if request.config is not None:
+        return request.config
+    own = RunFolder(out).config
+    return own if request.out is not None and own.is_file() else None
+
+
+def check_request(request: Request, config: Config, stage: str) -> None:
+    """What can be refused before any work: a wrong stage or combination, settings that do not fit."""
+    if stage not in STAGES:
+        raise UsageError(f"unknown stage {stage!r}; known: {', '.join(STAGES)}")
+    if request.engine != "local":
+        raise UsageError(f"engine {request.engine!r} is not available in this version; use --engine local")
+    if request.shard is not None and stage not in ("complete", "augment", "detect"):
+        raise UsageError(
+            f"--shard is for complete, augment and detect; run --stage {stage} once for all shards, without it"
+        )
+    from pipeline.stages import FRAME_STAGES
+
+    for name in frame_stages_for(stage, config):
+        FRAME_STAGES[name].settings(config)
+        FRAME_STAGES[name].weights(config)
+
+
+def prepare_folder(run: RunFolder, config: Config) -> None:
+    """Makes the run folder, clears what a killed run left behind, and writes the resolved configuration."""
+    resolved = config.model_copy(update={"made_with": made_with()})
+    try:
+        run.root.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(run.root)
+        write_text(run.config, dump_config(resolved))
+    except OSError as error:
+        raise UsageError(f"{run.root}: the run folder cannot be written: {error.strerror}") from None
+
+
+def make_data(config: Config, run: RunFolder, stage: str, shard: tuple[int, int] | None) -> None:
+    """Makes synthetic data when the run uses some that is not there yet."""
+    if config.data.name != "synthetic":
+        if stage == "synth":
+            raise UsageError("--stage synth makes synthetic data: use data.name=synthetic (the default configuration)")
+        return
+    root = data_root(config, run)
+    if shard is not None:
+        if not root.is_dir():
+            raise UsageError(f"{root}: make the data before starting shards: --stage synth")
+        return
+    from pipeline.synthetic import make_synthetic_data
+
+    make_synthetic_data(config, root)
+
+
+def dry_run(config: Config, run: RunFolder, stage: str, shard: tuple[int, int] | None) -> int:
+    """Prints what would be done; writes nothing."""
+    from pipeline.runner.estimate import StageEstimate, estimate, estimate_batch
+
+    stages = frame_stages_for(stage, config)
+    workers = config.run.workers or available_cores()
+    estimates: list[StageEstimate]
+    if config.data.name == "synthetic" and not data_root(config, run).is_dir():
+        from pipeline.synthetic import synth_settings
+
+        frames = synth_settings(config).frames
+        estimates = [estimate(name, frames, workers, None) for name in stages]
+    elif run.root.is_dir():
+        batch = open_batch(config, run, shard, StopRequest())
+        estimates = estimate_batch(batch, stages, workers)
+    else:
+        from pipeline.runner.batch import shard_of
+        from pipeline.stages import open_frames
+
+        frames = len(shard_of(open_frames(config, run).ids, shard))
+        estimates = [estimate(name, frames, workers, None) for name in stages]
+    print_dry_run(estimates, run, config)
+    return DONE
+
+
+def run_batch(request: Request, config: Config, run: RunFolder, stage: str, stop: StopRequest) -> int:
+    """The frame stages, then the scores and the report when they are asked for."""
+    batch = open_batch(config, run, request.shard, stop)
+    try:
+        summaries = [batch.run_stage(name) for name in frame_stages_for(stage, config) if not stop()]
+        if not stop() and stage in ("evaluate", "report"):
+            score(config, batch, explicit=request.stage == "evaluate")
+        failures = update_failures(run, request.command)
+    finally:
+        batch.engine.close()
+        batch.ledger.close()
+    if not stop() and stage == "report":
+        from pipeline.report.page import write_report
+
+        write_report(config, run, batch.dataset, batch.frames)
+    return conclude(request, run, stage, stop, summaries, bool(failures))
+
+
+def score(config: Config, batch: Batch, explicit: bool) -> None:
+    """metrics.json and tables.md of the run; frames that cannot be scored go to the ledger."""
+    from pipeline.scoring import evaluate_run
+
+    batch.ledger.forget_failures("evaluate", batch.frames)
+    frames = [frame_id for frame_id in batch.frames if frame_id not in batch.failed]
+    collected = evaluate_run(config, batch.run, batch.dataset, frames)
+    for failure in collected.failures:
+        print(failure.line(), file=sys.stderr)
+        batch.ledger.record(Outcome(Task("evaluate", failure.frame), failure=failure), key="")
+    if explicit and not collected.labels and not collected.depth:
+        raise UsageError(f"{batch.dataset.root}: nothing to evaluate: no frame has labels or true depth")
+
+
+def conclude(
+    request: Request, run: RunFolder, stage: str, stop: StopRequest, summaries: Sequence[StageSummary], failed: bool
+) -> int:
+    """Prints the end of the run and gives its exit code (128 + the signal's number after a signal)."""
+    print_summary(summaries)
+    if not stop() and stage in ("evaluate", "report"):
+        print_results(run)
+    if not stop() and stage == "report":
+        print(f"report: {run.report}")
+    if failed:
+        print(f"some frames failed: {run.failures} says which and why", file=sys.stderr)
+    if stop():
+        import shlex
+
+        print(f"{stop.reason}; to continue: {shlex.join(request.command)}", file=sys.stderr)
+        return 128 + stop.signal_number if stop.signal_number else SOME_FAILED
+    return SOME_FAILED if failed else DONE

@@ -1,0 +1,178 @@
+"""Local engine: the same tasks in this process or in N worker processes, each with one computing thread.
+
+One thread per process makes results identical for any N (the order of a floating-point sum does not depend on it), and
+uses the cores better than threads inside a frame do. A pipe per worker tells which task a dead worker had in hand.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Protocol
+
+from pipeline.errors import UsageError
+from pipeline.runner.jobs import Outcome, Task, crashed
+
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+class Worker(Protocol):
+    """What the engine needs of a worker."""
+
+    def do(self, task: Task) -> Outcome:
+        """The outcome of one task."""
+
+
+WorkerFactory = Callable[[], Worker]
+
+
+def available_cores() -> int:
+    """Cores this process may use (containers and `taskset` are respected)."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def use_one_thread() -> None:
+    """One computing thread in this process: by environment for libraries yet to be imported, by call for the others."""
+    for name in _THREAD_VARIABLES:
+        os.environ[name] = "1"
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(1)
+    if "numba" in sys.modules:
+        sys.modules["numba"].set_num_threads(1)
+
+
+class LocalEngine:
+    """Runs tasks with `workers` processes, or in this process when there is one worker."""
+
+    def __init__(self, make_worker: WorkerFactory, workers: int) -> None:
+        """make_worker  builds a worker; picklable when workers > 1"""
+        self._make_worker, self._count = make_worker, workers
+        self._inline: Worker | None = None
+        self._processes: list[_WorkerProcess] = []
+
+    def outcomes(self, tasks: Iterator[Task], stopping: Callable[[], bool]) -> Iterator[Outcome]:
+        """Outcomes in the order they come. No new task is begun once `stopping()`; those in hand are finished.
+
+        Each worker holds one task, and the next is taken from `tasks` when one is done: memory does not grow with
+        the number of tasks.
+        """
+        if self._count == 1:
+            yield from self._outcomes_here(tasks, stopping)
+            return
+        while len(self._processes) < self._count:
+            self._processes.append(_WorkerProcess(self._make_worker))
+        busy = self._feed(tasks, self._processes, stopping)
+        while busy:
+            for ready in wait([process.pipe for process in busy]):
+                process = next(process for process in busy if process.pipe is ready)
+                yield process.receive()
+                if process.ended:
+                    self._processes.remove(process)
+                    process = _WorkerProcess(self._make_worker)
+                    self._processes.append(process)
+                self._feed(tasks, [process], stopping)
+            busy = [process for process in self._processes if process.task is not None]
+
+    def _feed(
+        self, tasks: Iterator[Task], idle: list[_WorkerProcess], stopping: Callable[[], bool]
+    ) -> list[_WorkerProcess]:
+        """Gives each idle process a task; returns those that got one."""
+        fed: list[_WorkerProcess] = []
+        for process in idle:
+            task = None if stopping() else next(tasks, None)
+            if task is None:
+                break
+            process.send(task)
+            fed.append(process)
+        return fed
+
+    def _outcomes_here(self, tasks: Iterator[Task], stopping: Callable[[], bool]) -> Iterator[Outcome]:
+        if self._inline is None:
+            use_one_thread()
+            self._inline = self._make_worker()
+        while not stopping() and (task := next(tasks, None)) is not None:
+            yield self._inline.do(task)
+
+    def close(self) -> None:
+        """Ends the worker processes."""
+        for process in self._processes:
+            process.close()
+        self._processes.clear()
+        self._inline = None
+
+
+class _WorkerProcess:
+    """A process, the pipe to it, and the task it has in hand."""
+
+    def __init__(self, make_worker: WorkerFactory) -> None:
+        for name in _THREAD_VARIABLES:
+            os.environ[name] = "1"
+        context = multiprocessing.get_context("spawn")
+        self.pipe, inner = context.Pipe()
+        self.process: BaseProcess = context.Process(target=_serve, args=(inner, make_worker), daemon=True)
+        self.process.start()
+        inner.close()
+        self.task: Task | None = None
+        self.ended = False
+
+    def send(self, task: Task) -> None:
+        self.task = task
+        try:
+            self.pipe.send(task)
+        except OSError:
+            # It died while idle; `receive` finds the closed pipe and reports the task.
+            self.ended = True
+
+    def receive(self) -> Outcome:
+        """The outcome of the task in hand; a crash when the process ended."""
+        task, self.task = self.task, None
+        if task is None:
+            raise RuntimeError("a worker answered without having a task")
+        try:
+            answer = self.pipe.recv()
+        except (EOFError, OSError):
+            self.ended = True
+            self.process.join(timeout=5)
+            self.pipe.close()
+            return crashed(task, self.process.exitcode)
+        if isinstance(answer, Outcome):
+            return answer
+        raise UsageError(str(answer))
+
+    def close(self) -> None:
+        """Closing the pipe ends the process once its task is done."""
+        if not self.ended:
+            self.pipe.close()
+        self.process.join(timeout=10)
+        if self.process.is_alive():
+            self.process.kill()
+
+
+def _serve(pipe: Connection, make_worker: WorkerFactory) -> None:
+    """Body of a worker process: answers tasks until the parent closes the pipe or dies."""
+    # Ctrl-C reaches the whole process group; the parent decides when to stop, so that the frame in hand is finished.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    use_one_thread()
+    worker: Worker | None = None
+    while True:
+        try:
+            task = pipe.recv()
+        except (EOFError, OSError):
+            return
+        try:
+            worker = worker or make_worker()
+            answer: Outcome | str = worker.do(task)
+        except UsageError as error:
+            answer = str(error)
+        try:
+            pipe.send(answer)
+        except OSError:
+            return

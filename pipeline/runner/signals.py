@@ -1,0 +1,48 @@
+"""SIGINT and SIGTERM ask for a stop; the frame in hand is finished. A second signal ends the program at once."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+
+class StopRequest:
+    """Why the run should end early, or nothing."""
+
+    def __init__(self) -> None:
+        self.reason = ""
+        self.signal_number = 0
+
+    def __call__(self) -> bool:
+        """True once a stop is asked for."""
+        return bool(self.reason)
+
+    def ask(self, reason: str, signal_number: int = 0) -> None:
+        """Asks for a stop; the first reason stays."""
+        if not self.reason:
+            self.reason, self.signal_number = reason, signal_number
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[StopRequest]:
+    """A StopRequest that SIGINT and SIGTERM set while the block runs (main thread only; others catch nothing)."""
+    request = StopRequest()
+
+    def on_signal(number: int, _: FrameType | None) -> None:
+        if request():
+            signal.signal(number, signal.SIG_DFL)
+            signal.raise_signal(number)
+        request.ask(f"stopped by {signal.Signals(number).name}", number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield request
+        return
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield request
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

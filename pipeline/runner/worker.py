@@ -1,0 +1,42 @@
+"""The work itself, one frame at a time; an object of this kind lives in every worker process."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from pipeline.config import Config
+from pipeline.errors import DataError, UsageError
+from pipeline.frame_files import FrameFiles
+from pipeline.paths import RunFolder
+from pipeline.runner.jobs import Outcome, Task, outcome_of_error
+from pipeline.stages import FRAME_STAGES, FrameFunction, open_frames
+
+
+class FrameWorker:
+    """Does tasks of one run. Networks are loaded at the first task of a stage and dropped at the next stage's."""
+
+    def __init__(self, config: Config, out: Path) -> None:
+        self.config, self.run_folder = config, RunFolder(out)
+        self.dataset = open_frames(config, self.run_folder)
+        self._stage: tuple[str, FrameFunction] | None = None
+
+    def do(self, task: Task) -> Outcome:
+        """The outcome of a task; errors become part of it, whatever they are, so that other frames go on."""
+        try:
+            process_frame = self._function(task.stage)
+        except (UsageError, DataError, OSError, ValueError) as error:
+            return Outcome(task, refused=str(error))
+        start = time.perf_counter()
+        files = FrameFiles(self.run_folder, task.frame)
+        try:
+            process_frame(self.dataset[task.frame], files)
+        except Exception as error:
+            return outcome_of_error(task, error, time.perf_counter() - start)
+        return Outcome(task, files.written, time.perf_counter() - start)
+
+    def _function(self, stage: str) -> FrameFunction:
+        if self._stage is None or self._stage[0] != stage:
+            self._stage = None
+            self._stage = (stage, FRAME_STAGES[stage].prepare(self.config))
+        return self._stage[1]

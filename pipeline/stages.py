@@ -1,0 +1,278 @@
+"""The stages, each read, call, write; and what each depends on, so that the runner redoes exactly what changed.
+
+This file is the application's table of contents. The arithmetic is one call further: `completion.infer`,
+`pipeline.pointcloud.augment`, `detection.infer`, `detection.evaluation.kitti_ap`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.config import Config
+from pipeline.data import Dataset, Frame, open_dataset
+from pipeline.data.depth_png import read_depth_png
+from pipeline.errors import DataError, UsageError
+from pipeline.frame_files import FrameFiles
+from pipeline.paths import RunFolder
+from pipeline.runner.seeds import derive_seed
+from pipeline.settings import nearest_name, plain, with_changes
+from pipeline.weights import completion_weights, detection_weights, detector_name
+
+if TYPE_CHECKING:
+    from completion.types import CompletedDepth
+    from pipeline.pointcloud.presets import AugmentSettings
+
+FrameFunction = Callable[[Frame, FrameFiles], None]
+
+# The order of the work; asking for a stage runs what it needs before it.
+STAGES = ("synth", "train", "complete", "augment", "detect", "evaluate", "report")
+
+
+@dataclass(frozen=True)
+class FrameStage:
+    """A stage that works on one frame at a time.
+
+    prepare   loads networks and gives the function that reads, calls and writes
+    settings  everything of the configuration its result depends on
+    parts     the parts of the frame it reads
+    files     the files of earlier stages (or of the user) it reads for a frame
+    weights   the weight files it loads
+    code      package folders whose source decides the result
+    seconds   wall time of one KITTI frame on one core, for --dry-run before anything was measured
+    megabytes size of what it writes for one KITTI frame
+    """
+
+    prepare: Callable[[Config], FrameFunction]
+    settings: Callable[[Config], Any]
+    parts: Callable[[Config, Frame], tuple[str, ...]]
+    files: Callable[[Config, RunFolder, str], tuple[Path, ...]]
+    weights: Callable[[Config], tuple[Path, ...]]
+    code: tuple[str, ...]
+    seconds: float
+    megabytes: float
+
+
+# --- complete: sparse depth + image -> dense depth with two surfaces
+
+
+def prepare_complete(config: Config) -> FrameFunction:
+    """Sparse depth and image in, depth/ID.png and twin/ID.npz out."""
+    from completion.infer import load_completer
+
+    completer = load_completer(config.completion.model, config.completion.device, config.completion.backend)
+
+    def complete(frame: Frame, files: FrameFiles) -> None:
+        camera = frame.calibration.K if frame.has("calibration") else None
+        files.write_completed(completer.complete(frame.sparse_depth, frame.image, camera))
+
+    return complete
+
+
+def _complete_parts(config: Config, frame: Frame) -> tuple[str, ...]:
+    sparse = ("sparse_depth",) if frame.has("sparse_depth") else ("points",)
+    return ("image", "calibration", *sparse)
+
+
+# --- augment: dense depth -> augmented LiDAR
+
+
+def prepare_augment(config: Config) -> FrameFunction:
+    """Completed depth, raw LiDAR and masks in, cloud/ID.bin out."""
+    from pipeline.pointcloud.augment import augment_frame
+
+    settings = augment_settings(config)
+
+    def augment(frame: Frame, files: FrameFiles) -> None:
+        completed = with_sigma(completed_depth(config, frame, files), settings)
+        semantics = frame.semantics if settings.needs_semantics else None
+        seed = derive_seed(config.seed, frame.id, "augment")
+        files.write_cloud(augment_frame(completed, frame.points, frame.calibration, settings, semantics, seed))
+
+    return augment
+
+
+def augment_settings(config: Config) -> AugmentSettings:
+    """The preset with the changes of the configuration. Raises UsageError when they cannot be used."""
+    from pipeline.pointcloud.presets import PRESETS
+
+    section = config.augment
+    if section.preset not in PRESETS:
+        raise UsageError(f"augment.preset: unknown preset {section.preset!r}; {nearest_name(section.preset, PRESETS)}")
+    settings = with_changes(PRESETS[section.preset], section.library, "augment")
+    if section.semantics not in (None, "dataset"):
+        raise UsageError(f"augment.semantics: expected 'dataset' or nothing, got {section.semantics!r}")
+    if settings.needs_semantics and section.semantics is None:
+        raise UsageError(
+            f"augment.preset {section.preset} needs object masks: set augment.semantics=dataset when the data set has "
+            "them (synthetic, Virtual KITTI 2), or choose a preset without masks (L_D_F)"
+        )
+    return settings
+
+
+def completed_depth(config: Config, frame: Frame, files: FrameFiles) -> CompletedDepth:
+    """Completed depth of this run, or of the folder `augment.depth_from`."""
+    from completion.types import CompletedDepth
+
+    if config.augment.depth_from is None:
+        return files.read_completed()
+    path = Path(config.augment.depth_from) / f"{frame.id}.png"
+    depth = read_depth_png(path)
+    if depth.shape != tuple(frame.image_size):
+        hint = "was it cropped? pad it back to the full image first"
+        raise DataError(path, f"a depth map of the image's size {frame.image_size}", f"{depth.shape}", hint)
+    return CompletedDepth(depth)
+
+
+def with_sigma(completed: CompletedDepth, settings: AugmentSettings) -> CompletedDepth:
+    """The completed depth, with surfaces estimated from its local spread when the settings need some it has not."""
+    if completed.has_surfaces or not settings.needs_surfaces:
+        return completed
+    from pipeline.pointcloud.pseudo_sigma import pseudo_sigma
+
+    return pseudo_sigma(completed)
+
+
+def _augment_settings_record(config: Config) -> Any:
+    return {"settings": plain(augment_settings(config)), "seed": config.seed}
+
+
+def _augment_parts(config: Config, frame: Frame) -> tuple[str, ...]:
+    return (
+        ("points", "calibration", "semantics")
+        if augment_settings(config).needs_semantics
+        else ("points", "calibration")
+    )
+
+
+def _augment_files(config: Config, run: RunFolder, frame_id: str) -> tuple[Path, ...]:
+    if config.augment.depth_from is not None:
+        return (Path(config.augment.depth_from) / f"{frame_id}.png",)
+    return run.depth(frame_id), run.twin(frame_id)
+
+
+# --- detect: cloud -> KITTI result lines
+
+
+def prepare_detect(config: Config) -> FrameFunction:
+    """Augmented cloud (or raw LiDAR with preset L) in, detections/ID.txt out."""
+    from detection.infer import load_detector
+    from detection.results import result_objects
+    from detection.types import PointFrame
+
+    detector = load_detector(detector_name(config), config.detection.device, config.seed)
+
+    def detect(frame: Frame, files: FrameFiles) -> None:
+        camera = frame.calibration
+        points = cloud_of(config, frame, files)
+        cloud = PointFrame(points, camera.T_cam_velo, camera.P2, frame.image_size, frame.id)
+        files.write_detections(result_objects(detector.detect(cloud), cloud))
+
+    return detect
+
+
+def uses_raw_lidar(config: Config) -> bool:
+    """True with preset L: the detector takes the sensor's points, and nothing is completed or augmented for it."""
+    return config.augment.preset == "L" and not config.augment.library
+
+
+def cloud_of(config: Config, frame: Frame, files: FrameFiles) -> NDArray[np.float32]:
+    """(N, 4 or 5 + C) float32 points for the detector, LiDAR frame."""
+    return frame.points if uses_raw_lidar(config) else files.read_cloud()
+
+
+def _detect_parts(config: Config, frame: Frame) -> tuple[str, ...]:
+    return ("calibration", "image_size", "points") if uses_raw_lidar(config) else ("calibration", "image_size")
+
+
+def _detect_files(config: Config, run: RunFolder, frame_id: str) -> tuple[Path, ...]:
+    if uses_raw_lidar(config):
+        return ()
+    return run.cloud(frame_id), run.cloud_columns(frame_id), run.counts(frame_id)
+
+
+FRAME_STAGES: dict[str, FrameStage] = {
+    "complete": FrameStage(
+        prepare_complete,
+        lambda config: config.completion.model_dump(),
+        _complete_parts,
+        lambda config, run, frame_id: (),
+        completion_weights,
+        ("completion", "pipeline/data"),
+        seconds=3.0,
+        megabytes=1.2,
+    ),
+    "augment": FrameStage(
+        prepare_augment,
+        _augment_settings_record,
+        _augment_parts,
+        _augment_files,
+        lambda config: (),
+        ("pipeline/pointcloud", "pipeline/data"),
+        seconds=0.3,
+        megabytes=0.8,
+    ),
+    "detect": FrameStage(
+        prepare_detect,
+        lambda config: {**config.detection.model_dump(), "name": detector_name(config), "seed": config.seed},
+        _detect_parts,
+        _detect_files,
+        detection_weights,
+        ("detection", "pipeline/data"),
+        seconds=2.0,
+        megabytes=0.01,
+    ),
+}
+
+
+def frame_stages_for(stage: str, config: Config) -> list[str]:
+    """The frame stages that `stage` (one of STAGES) needs, in order, itself included when it is one."""
+    if stage in ("synth", "train"):
+        return []
+    wanted = list(FRAME_STAGES)
+    if stage in FRAME_STAGES:
+        wanted = wanted[: wanted.index(stage) + 1]
+    if config.augment.depth_from is not None and stage != "complete":
+        wanted.remove("complete")
+    if uses_raw_lidar(config) and stage in ("detect", "evaluate", "report"):
+        wanted = ["detect"]
+    return wanted
+
+
+def data_root(config: Config, run: RunFolder) -> Path:
+    """The folder frames are read from. Raises UsageError when a data set needs one and none is given."""
+    if config.data.root is not None:
+        return Path(config.data.root)
+    if config.data.name == "synthetic":
+        return run.root / "data"
+    raise UsageError(f"data set {config.data.name} needs a folder: give --data DIR or data.root in the configuration")
+
+
+def reader_name(config: Config) -> str:
+    """The reader of the data set; synthetic data is written in a public layout and read by that layout's reader."""
+    if config.data.name != "synthetic":
+        return config.data.name
+    layout = str(config.synth.library.get("layout", "kitti"))
+    return {"kitti": "kitti_object"}.get(layout, layout)
+
+
+def open_frames(config: Config, run: RunFolder) -> Dataset:
+    """The frames of the run, selected by `data.frames`.
+
+    A name like `val` finds ROOT/ImageSets/val.txt. Raises UsageError when there is no frame.
+    """
+    root = data_root(config, run)
+    dataset = open_dataset(reader_name(config), root)
+    frames = config.data.frames
+    if frames is None:
+        return dataset
+    split = root / "ImageSets" / f"{frames}.txt"
+    selected = dataset.select(split if frames.isidentifier() and split.is_file() else frames)
+    if not len(selected):
+        raise UsageError(f"{root}: no frame is left of {len(dataset)} by the selection {frames!r}")
+    return selected
