@@ -1,0 +1,151 @@
+"""The detectors one can ask for by name: network, input and output settings together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from torch import nn
+
+from detection.inputs import InputSettings
+from detection.models.compact import CLASSES, CompactPointRCNN, CompactSettings
+from detection.models.pointrcnn import PointRCNN, PointRCNNSettings
+from detection.models.proposals import ProposalSettings
+from detection.targets import RoiSamplingSettings
+
+# Values of the released configurations of PointRCNN and EPNet.
+_NEAR_FAR_TRAIN = ProposalSettings(before=9000, after=512, iou=0.85, by_distance=True, rotated=False)
+_NEAR_FAR_TEST = ProposalSettings(before=9000, after=100, iou=0.8, by_distance=True, rotated=False)
+
+
+@dataclass(frozen=True)
+class OutputSettings:
+    """From refined boxes to detections.
+
+    score_threshold  on the sigmoid of the score
+    nms_iou          rotated BEV IoU above which the lower score is suppressed, per class
+    probability      detections carry the sigmoid; else the raw logit, as the reference's result files do
+    mirrored_pass    detect on the mirrored cloud as well and pool the boxes
+    vote_iou         boxes of a class that overlap a kept one by more are averaged with it by score; 1 = no voting
+    """
+
+    score_threshold: float
+    nms_iou: float = 0.1
+    probability: bool = False
+    mirrored_pass: bool = False
+    vote_iou: float = 1.0
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A detector by name.
+
+    options  arguments that rebuild it: PRESETS[name](**options)
+    skip_empty_frames  training leaves out frames without a box of the classes, as PointRCNN does
+    """
+
+    name: str
+    classes: tuple[str, ...]
+    inputs: InputSettings
+    outputs: OutputSettings
+    build: Callable[[], nn.Module]
+    options: dict[str, Any] = field(default_factory=dict)
+    skip_empty_frames: bool = True
+
+
+def small(features: tuple[str, ...] = ("height", "range"), points: int = 8192, width: float = 1.0) -> Preset:
+    """The CPU detector for Car, Pedestrian and Cyclist that this project trains and ships.
+
+    features  point columns; add "source" (and "semantic") for augmented clouds
+    width     factor on all layer widths of the first stage
+    """
+    features = tuple(features)
+    settings = CompactSettings(features=features).widened(width)
+    return Preset(
+        name="small",
+        classes=CLASSES,
+        inputs=InputSettings(points, "balanced", features, cloud=60000),
+        outputs=OutputSettings(0.1, 0.1, probability=True, mirrored_pass=True, vote_iou=0.5),
+        build=lambda: CompactPointRCNN(settings),
+        options={"features": list(features), "points": points, "width": width},
+        skip_empty_frames=False,
+    )
+
+
+def _published(name: str, settings: PointRCNNSettings, inputs: InputSettings, options: dict[str, Any]) -> Preset:
+    # The second stage's score threshold equals the mask threshold in both published configurations.
+    outputs = OutputSettings(settings.mask_threshold, nms_iou=0.1)
+    return Preset(name, ("Car",), inputs, outputs, lambda: PointRCNN(settings), options)
+
+
+def pointrcnn(fine_location: bool = False, features: tuple[str, ...] = ()) -> Preset:
+    """PointRCNN (Shi et al. 2019). The released weights lack residuals per bin (fine_location False, 52 channels)."""
+    settings = PointRCNNSettings(
+        extra_channels=len(features),
+        fine_location=fine_location,
+        soft_decoding=False,
+        consistency_weight=0.0,
+        mask_threshold=0.3,
+        pool_margin=1.0,
+        head_width=256,
+        iou_branch=False,
+        roi_augmentation=True,
+        proposals_train=_NEAR_FAR_TRAIN,
+        proposals_test=_NEAR_FAR_TEST,
+        rois=RoiSamplingSettings(),
+    )
+    options = {"fine_location": fine_location, "features": list(features)}
+    return _published("pointrcnn", settings, InputSettings(16384, "near_far", tuple(features)), options)
+
+
+def _epnet_settings(features: tuple[str, ...], iou_branch: bool) -> PointRCNNSettings:
+    return PointRCNNSettings(
+        extra_channels=len(features),
+        fine_location=True,
+        soft_decoding=True,
+        consistency_weight=5.0,
+        mask_threshold=0.2,
+        pool_margin=0.2,
+        head_width=512,
+        iou_branch=iou_branch,
+        roi_augmentation=True,
+        proposals_train=_NEAR_FAR_TRAIN,
+        proposals_test=_NEAR_FAR_TEST,
+        rois=RoiSamplingSettings(),
+    )
+
+
+def pointrcnn2(features: tuple[str, ...] = (), iou_branch: bool = False) -> Preset:
+    """EPNet without image fusion, the thesis' "PointRCNN2", with the values of the released code."""
+    settings = _epnet_settings(tuple(features), iou_branch)
+    options = {"features": list(features), "iou_branch": iou_branch}
+    return _published("pointrcnn2", settings, InputSettings(16384, "near_far", tuple(features)), options)
+
+
+def thesis(features: tuple[str, ...] = (), dense: bool = True) -> Preset:
+    """PointRCNN2 as thesis chapter 5 words it: the 8000 best scores, NMS 0.8, 64 boxes, no augmentation of RoIs.
+
+    dense     50k uniformly drawn points (completed depth) instead of 16384 by the near/far rule
+    features  ("semantic",) for the binary mask of section 5.3
+    Train it with scene=None and paste=None.
+    """
+    proposals = ProposalSettings(before=8000, after=64, iou=0.8, by_distance=False, rotated=True)
+    settings = replace(
+        _epnet_settings(tuple(features), iou_branch=False),
+        roi_augmentation=False,
+        proposals_train=proposals,
+        proposals_test=proposals,
+    )
+    inputs = (
+        InputSettings(50000, "uniform", tuple(features)) if dense else InputSettings(16384, features=tuple(features))
+    )
+    return _published("thesis", settings, inputs, {"features": list(features), "dense": dense})
+
+
+PRESETS: dict[str, Callable[..., Preset]] = {
+    "small": small,
+    "pointrcnn": pointrcnn,
+    "pointrcnn2": pointrcnn2,
+    "thesis": thesis,
+}

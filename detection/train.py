@@ -1,0 +1,385 @@
+"""Training a detector on frames with labels: by steps, resumable to the bit, in one or several processes.
+
+Everything random at a step derives from (seed, step, rank), so a run that was killed continues exactly as if it had not
+been. Several processes (torchrun, or `train_in_processes`) average their gradients after each backward pass.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import numpy as np
+import torch
+import torch.distributed as dist
+from numpy.typing import NDArray
+from torch import Tensor
+
+from detection.augment import (
+    DatabaseObject,
+    PasteSettings,
+    SceneAugmentation,
+    TrainingScene,
+    augment_scene,
+    cut_objects,
+    paste_objects,
+)
+from detection.checkpoints import load_checkpoint, load_tensors, save_checkpoint, save_tensors, write_atomically
+from detection.inputs import CameraCloud, camera_cloud, ground_height, network_input, truth_boxes
+from detection.kitti_format import KittiObject, boxes_of
+from detection.models.batch import DetectorModel, PointBatch
+from detection.models.layers import set_batchnorm_momentum
+from detection.models.presets import PRESETS, Preset
+from detection.models.warm_start import copy_matching
+from detection.optimiser import AdamOneCycle, OneCycleSettings, batchnorm_momentum
+from detection.types import PointFrame
+
+
+class LabelledFrames(Protocol):
+    """A data source: its length, and frame i with its labels."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> tuple[PointFrame, list[KittiObject]]: ...
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """One training run.
+
+    preset, options  the detector, PRESETS[preset](**options)
+    steps            updates in all        batch_size  frames per process and update
+    optimiser        the one-cycle schedule, over `steps`
+    scene            scene augmentation, or None (the thesis uses none)
+    paste            ground truth sampling, or None; objects come from `paste_frames` frames drawn at the start
+    warm_start       weights to begin with; input channels they lack start at zero
+    save_every, log_every  steps
+    """
+
+    preset: str = "small"
+    options: dict[str, Any] = dataclasses.field(default_factory=dict)
+    steps: int = 20000
+    batch_size: int = 2
+    seed: int = 0
+    optimiser: OneCycleSettings = dataclasses.field(default_factory=OneCycleSettings)
+    scene: SceneAugmentation | None = dataclasses.field(default_factory=SceneAugmentation)
+    paste: PasteSettings | None = None
+    paste_frames: int = 200
+    warm_start: str | None = None
+    save_every: int = 500
+    log_every: int = 20
+
+
+@dataclass(frozen=True)
+class TrainProgress:
+    """What a progress callback is told: step (1-based) of steps, epoch, mean losses since the last call, seconds per
+    step, and the seconds that remain."""
+
+    step: int
+    steps: int
+    epoch: int
+    losses: dict[str, float]
+    seconds_per_step: float
+    eta_seconds: float
+
+
+@dataclass(frozen=True)
+class _Workers:
+    """This process among those of the run."""
+
+    rank: int
+    count: int
+
+    @classmethod
+    def current(cls) -> _Workers:
+        """From torchrun's environment; alone without it."""
+        if "RANK" in os.environ and "WORLD_SIZE" in os.environ and not dist.is_initialized():
+            dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+        if dist.is_initialized():
+            return cls(dist.get_rank(), dist.get_world_size())
+        return cls(0, 1)
+
+    def average(self, tensors: list[Tensor]) -> None:
+        """Replace each tensor by its mean over all processes, in one message."""
+        if self.count == 1 or not tensors:
+            return
+        flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
+        dist.all_reduce(flat)
+        flat /= self.count
+        for tensor, part in zip(tensors, flat.split([tensor.numel() for tensor in tensors])):
+            tensor.copy_(part.view_as(tensor))
+
+
+def frame_order(step: int, frames: int, settings: TrainSettings, rank: int, workers: int) -> list[int]:
+    """Frames of a step for one process: consecutive places of a permutation drawn anew for every epoch."""
+    first = (step * workers + rank) * settings.batch_size
+    chosen = []
+    for place in range(first, first + settings.batch_size):
+        epoch, within = divmod(place, frames)
+        chosen.append(int(np.random.default_rng([settings.seed, 1, epoch]).permutation(frames)[within]))
+    return chosen
+
+
+def training_scene(frame: PointFrame, labels: Sequence[KittiObject], preset: Preset) -> TrainingScene:
+    """The visible points, their heights and the boxes of one frame, in the camera frame."""
+    cloud = camera_cloud(frame)
+    truth = truth_boxes(labels, preset.classes)
+    solid = [item for item in labels if item.type != "DontCare" and min(item.size) > 0]
+    points = np.concatenate([cloud.xyz, cloud.columns], axis=1)
+    return TrainingScene(points, ground_height(cloud.xyz), truth.boxes, truth.classes, boxes_of(solid).values)
+
+
+def object_database(samples: LabelledFrames, preset: Preset, settings: TrainSettings) -> list[DatabaseObject]:
+    """Objects to paste, cut out of `paste_frames` frames drawn by the seed."""
+    if settings.paste is None:
+        return []
+    rng = np.random.default_rng([settings.seed, 2])
+    chosen = rng.permutation(len(samples))[: settings.paste_frames]
+    scenes = (training_scene(*samples[int(index)], preset) for index in chosen)
+    return [item for scene in scenes for item in cut_objects(scene, settings.paste.min_points)]
+
+
+def _load_scene(samples: LabelledFrames, index: int, preset: Preset) -> tuple[TrainingScene, str]:
+    """The scene of a frame, or of the next usable one: with visible points and, where the preset asks, a box."""
+    for shift in range(len(samples)):
+        frame, labels = samples[(index + shift) % len(samples)]
+        scene = training_scene(frame, labels, preset)
+        if len(scene.points) and (len(scene.boxes) or not preset.skip_empty_frames):
+            return scene, frame.id
+    raise ValueError(
+        f"training: none of the {len(samples)} frames has visible points and an object of {', '.join(preset.classes)}"
+    )
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    points: NDArray[np.float32]
+    cloud: NDArray[np.float32]
+    boxes: NDArray[np.float64]
+    classes: NDArray[np.int64]
+
+
+def prepare_sample(
+    scene: TrainingScene,
+    preset: Preset,
+    settings: TrainSettings,
+    database: Sequence[DatabaseObject],
+    rng: np.random.Generator,
+) -> _Prepared:
+    """Augment a scene and draw the network's points."""
+    if settings.paste is not None:
+        scene = paste_objects(scene, database, settings.paste, rng)
+    if settings.scene is not None:
+        scene = augment_scene(scene, settings.scene, rng)
+    cloud = CameraCloud(scene.points[:, :3], scene.points[:, 3:])
+    points, full = network_input(cloud, scene.height, preset.inputs, rng)
+    return _Prepared(points, full, scene.boxes, scene.classes)
+
+
+def collate(samples: Sequence[_Prepared], device: torch.device) -> PointBatch:
+    """A batch on the device."""
+
+    def on_device(values: NDArray[Any]) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values)).to(device)
+
+    return PointBatch(
+        points=torch.stack([on_device(item.points) for item in samples]),
+        clouds=[on_device(item.cloud) for item in samples],
+        boxes=[on_device(item.boxes.astype(np.float32)) for item in samples],
+        classes=[on_device(item.classes) for item in samples],
+    )
+
+
+class Trainer:
+    """The state of a run and its one step."""
+
+    def __init__(self, settings: TrainSettings, samples: LabelledFrames, device: str) -> None:
+        if len(samples) == 0:
+            raise ValueError("training: expected at least one frame, got an empty data source")
+        self.settings, self.samples, self.device = settings, samples, torch.device(device)
+        self.workers = _Workers.current()
+        self.preset = PRESETS[settings.preset](**settings.options)
+        torch.manual_seed(settings.seed)
+        self.model = self.preset.build().to(self.device)
+        if settings.warm_start is not None:
+            copy_matching(load_checkpoint(settings.warm_start)[0], self.model)
+        self.optimiser = AdamOneCycle(self.model, settings.steps, settings.optimiser)
+        self.database = object_database(samples, self.preset, settings)
+        self.epoch_steps = max(1, len(samples) // (settings.batch_size * self.workers.count))
+
+    def batch(self, step: int) -> PointBatch:
+        """The frames of a step, prepared with the step's own random numbers."""
+        rng = np.random.default_rng([self.settings.seed, 3, step, self.workers.rank])
+        order = frame_order(step, len(self.samples), self.settings, self.workers.rank, self.workers.count)
+        scenes = [_load_scene(self.samples, index, self.preset)[0] for index in order]
+        prepared = [prepare_sample(scene, self.preset, self.settings, self.database, rng) for scene in scenes]
+        return collate(prepared, self.device)
+
+    def step(self, step: int) -> dict[str, float]:
+        """One update; returns the losses and the norm of the gradient."""
+        batch = self.batch(step)
+        seeds = np.random.SeedSequence([self.settings.seed, 4, step, self.workers.rank])
+        torch.manual_seed(int(seeds.generate_state(1, np.uint64)[0] >> 1))
+        self.model.train()
+        set_batchnorm_momentum(self.model, batchnorm_momentum(step, self.epoch_steps))
+        losses = cast(DetectorModel, self.model).training_losses(batch, np.random.default_rng(seeds.spawn(1)[0]))
+        if not bool(torch.isfinite(losses["loss"])):
+            raise ValueError(f"training: the loss is not finite at step {step + 1}; lower optimiser.peak")
+        losses["loss"].backward()
+        gradients = [parameter.grad for parameter in self.optimiser.parameters if parameter.grad is not None]
+        self.workers.average(gradients)
+        norm = self.optimiser.step(step)
+        # Running statistics too, so that every process holds the same network.
+        self.workers.average([buffer for buffer in self.model.buffers() if buffer.is_floating_point()])
+        return {**{name: float(value.detach()) for name, value in losses.items()}, "gradient_norm": norm}
+
+    def save(self, path: Path, done: int) -> None:
+        """The complete state after `done` steps, atomically."""
+        tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
+        tensors |= {f"adam.{name}": value for name, value in self.optimiser.state_tensors().items()}
+        save_tensors(path, tensors, {"done": str(done), "settings": _settings_text(self.settings, self.workers.count)})
+
+    def resume(self, path: Path) -> int:
+        """Load the state if there is one; returns the steps done. Raises ValueError for the state of another run."""
+        if not path.is_file():
+            return 0
+        tensors, metadata = load_tensors(path)
+        if metadata.get("settings") != _settings_text(self.settings, self.workers.count):
+            raise ValueError(f"{path}: the state of a run with other settings; use another output folder or remove it")
+
+        def under(prefix: str) -> dict[str, Tensor]:
+            return {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
+
+        self.model.load_state_dict(under("model."))
+        self.optimiser.load_state_tensors(under("adam."))
+        return int(metadata["done"])
+
+
+def _settings_text(settings: TrainSettings, processes: int) -> str:
+    """What must agree for a run to be continued."""
+    values = dataclasses.asdict(settings)
+    for free in ("save_every", "log_every"):
+        del values[free]
+    return json.dumps({**values, "processes": processes}, sort_keys=True)
+
+
+class _Log:
+    """log.csv of a run, and TensorBoard when it is installed."""
+
+    def __init__(self, folder: Path, done: int) -> None:
+        self.path = folder / "log.csv"
+        rows = list(csv.reader(io.StringIO(self.path.read_text()))) if self.path.is_file() else []
+        self.header = rows[0] if rows else []
+        # Rows written after the last saved state are written again.
+        kept = [row for row in rows if row and (row[0] == "step" or int(row[0]) <= done)]
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows(kept)
+        write_atomically(self.path, text.getvalue().encode())
+        self.board = _tensorboard(folder)
+
+    def write(self, step: int, values: dict[str, float]) -> None:
+        """Append one row."""
+        with self.path.open("a", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            if not self.header:
+                self.header = ["step", *values]
+                writer.writerow(self.header)
+            writer.writerow([step, *(f"{values[name]:.6g}" for name in self.header[1:])])
+        if self.board is not None:
+            for name, value in values.items():
+                self.board.add_scalar(name, value, step)
+
+
+def _tensorboard(folder: Path) -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        return None
+    return SummaryWriter(str(folder / "tensorboard"))
+
+
+def train(
+    settings: TrainSettings,
+    samples: LabelledFrames,
+    out: str | Path,
+    device: str = "cpu",
+    progress: Callable[[TrainProgress], None] | None = None,
+) -> Path:
+    """Train a detector; returns out/model.safetensors (its card is out/model.json).
+
+    samples  len() and samples[i] -> (PointFrame, list of KittiObject)
+    out      also holds state.safetensors (a run started again continues from it) and log.csv
+    Under torchrun every process calls this with the same arguments; rank 0 writes.
+    Raises ValueError for an empty source, a state of other settings, or a loss that is not finite.
+    """
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    trainer = Trainer(settings, samples, device)
+    state = folder / "state.safetensors"
+    done = trainer.resume(state)
+    is_first = trainer.workers.rank == 0
+    log = _Log(folder, done) if is_first else None
+    sums: dict[str, float] = {}
+    started = last = time.perf_counter()
+    for step in range(done, settings.steps):
+        for name, value in trainer.step(step).items():
+            sums[name] = sums.get(name, 0.0) + value
+        number = step + 1
+        if number % settings.log_every == 0 or number == settings.steps:
+            count = (number - 1) % settings.log_every + 1
+            count = min(count, number - done)
+            means = {name: value / count for name, value in sums.items()}
+            now = time.perf_counter()
+            if log is not None:
+                rate = (now - started) / (number - done)
+                log.write(number, {**means, "seconds_per_step": (now - last) / count})
+                if progress is not None:
+                    epoch = step // trainer.epoch_steps
+                    progress(
+                        TrainProgress(number, settings.steps, epoch, means, rate, rate * (settings.steps - number))
+                    )
+            sums, last = {}, now
+        if is_first and (number % settings.save_every == 0 or number == settings.steps):
+            trainer.save(state, number)
+    facts = {
+        "steps": settings.steps,
+        "seed": settings.seed,
+        "frames": len(samples),
+        "training": json.loads(_settings_text(settings, trainer.workers.count)),
+        "versions": {"torch": torch.__version__, "numpy": np.__version__},
+    }
+    path = folder / "model.safetensors"
+    return save_checkpoint(trainer.model, trainer.preset, path, facts) if is_first else path
+
+
+def _train_worker(rank: int, count: int, port: int, arguments: tuple[Any, ...]) -> None:
+    os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(count), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    torch.set_num_threads(1)
+    settings, samples, out = arguments
+    try:
+        train(settings, samples, out)
+    finally:
+        if dist.is_initialized():
+            dist.destroy_process_group()
+
+
+def train_in_processes(settings: TrainSettings, samples: LabelledFrames, out: str | Path, processes: int) -> Path:
+    """`train` on the CPU in several one-thread processes with averaged gradients (2 such beat one with two threads).
+
+    samples must be picklable (it is sent to the processes). settings.batch_size counts per process.
+    """
+    import socket
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    torch.multiprocessing.spawn(_train_worker, args=(processes, port, (settings, samples, out)), nprocs=processes)
+    return Path(out) / "model.safetensors"
