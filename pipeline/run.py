@@ -57,12 +57,13 @@ def carry_out(request: Request) -> int:
     if stage == "synth":
         print(f"synthetic data: {data_root(config, run)}")
         return DONE
-    if stage == "train":
+    with stop_on_signals() as stop:
+        code = run_batch(request, config, run, stage, stop)
+    if stage == "train" and code == DONE:
         from pipeline.training import train_stage
 
-        return train_stage(config, run)
-    with stop_on_signals() as stop:
-        return run_batch(request, config, run, stage, stop)
+        print(f"weights: {train_stage(config, run)}")
+    return code
 
 
 def default_out(config: str | None) -> Path:

@@ -232,15 +232,17 @@ FRAME_STAGES: dict[str, FrameStage] = {
 
 def frame_stages_for(stage: str, config: Config) -> list[str]:
     """The frame stages that `stage` (one of STAGES) needs, in order, itself included when it is one."""
-    if stage in ("synth", "train"):
-        return []
-    wanted = list(FRAME_STAGES)
+    last = {"synth": None, "train": "augment" if config.train.network == "detection" else None}.get(stage, "detect")
     if stage in FRAME_STAGES:
-        wanted = wanted[: wanted.index(stage) + 1]
+        last = stage
+    if last is None:
+        return []
+    order = list(FRAME_STAGES)
+    wanted = order[: order.index(last) + 1]
+    if uses_raw_lidar(config) and stage not in ("complete", "augment"):
+        wanted = [name for name in wanted if name == "detect"]
     if config.augment.depth_from is not None and stage != "complete":
-        wanted.remove("complete")
-    if uses_raw_lidar(config) and stage in ("detect", "evaluate", "report"):
-        wanted = ["detect"]
+        wanted = [name for name in wanted if name != "complete"]
     return wanted
 
 
