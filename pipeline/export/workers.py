@@ -1,0 +1,46 @@
+"""Frames through worker processes, in order and with a bounded number under way: 7481 need no more memory than 10."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from itertools import islice
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def default_workers() -> int:
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def map_ordered(function: Callable[[Item], Result], items: Iterable[Item], workers: int) -> Iterator[Result]:
+    """`function` of every item, in the order of the items, on `workers` processes (1: in this one).
+
+    At most four items per worker are under way or waiting to be taken, so neither inputs nor results pile up.
+    `function` goes along with every item, so it should be small; an exception of `function` is raised here.
+    """
+    if workers <= 1:
+        yield from map(function, items)
+        return
+    # Started afresh rather than forked: threads of torch or OpenCV in this process would not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    waiting = iter(items)
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_one_thread) as pool:
+        under_way: deque[Future[Result]] = deque(pool.submit(function, item) for item in islice(waiting, 4 * workers))
+        while under_way:
+            result = under_way.popleft().result()
+            under_way.extend(pool.submit(function, item) for item in islice(waiting, 1))
+            yield result
+
+
+def _one_thread() -> None:
+    """The processes share the cores; OpenCV's own threads would compete with them."""
+    import cv2
+
+    cv2.setNumThreads(1)
