@@ -39,3 +39,19 @@ def for_ranges(work: Callable[[int, int], None], count: int, threads: int, minim
     bounds = [count * part // parts for part in range(parts + 1)]
     with ThreadPoolExecutor(parts) as pool:
         list(pool.map(work, bounds[:-1], bounds[1:]))
+
+
+def for_blocks(work: Callable[[slice, slice], None], shape: tuple[int, int], threads: int, minimum: int) -> None:
+    """Call `work(batch_slice, item_slice)` until `shape` = (batch, items) is covered, in up to `threads` threads.
+
+    Whole batch elements are shared out when there are enough of them, otherwise the items of one after the other;
+    either way a slice of a C-contiguous array stays contiguous.
+    """
+    batch, count = shape
+    if batch >= threads:
+        everything = slice(0, count)
+        for_ranges(lambda i, j: work(slice(i, j), everything), batch, threads, max(1, minimum // max(1, count)))
+        return
+    for element in range(batch):
+        one = slice(element, element + 1)
+        for_ranges(lambda i, j, one=one: work(one, slice(i, j)), count, threads, minimum)  # type: ignore[misc]
