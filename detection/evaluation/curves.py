@@ -106,7 +106,7 @@ def resampled_ap(records: MatchRecords, weights: Index, recall_points: int, *, o
     return np.asarray(_resampled_ap(*_arrays(records), weights, recall_points, orientation))
 
 
-def _arrays(records: MatchRecords) -> tuple[Array | Index, ...]:
+def _arrays(records: MatchRecords) -> tuple[Index, Array, Index, Array, Index, Index, Index, Array]:
     return (
         records.n_labels,
         records.tp_score,

@@ -122,3 +122,18 @@ def occlusion_from_fill(occupancy_ratio: Array, full_fill: float) -> Array:
     if not 0 < full_fill <= 1:
         raise ValueError(f"full_fill: expected a fraction in (0, 1], got {full_fill}")
     return np.clip(1 - np.asarray(occupancy_ratio, dtype=np.float64) / full_fill, 0, 1)
+
+
+def difficulty_named(name: str, flavor: str) -> DifficultyRule:
+    """The rule of "kitti" or "vkitti2", the latter with its options appended, as in "vkitti2:and:bands:ignore".
+
+    Options: or, and; cumulative, bands; next, ignore (see Vkitti2Difficulty). Raises ValueError for anything else.
+    """
+    base, *options = name.split(":")
+    if base == "kitti" and not options:
+        return KittiDifficulty(flavor)
+    fields = {"or": "medium", "and": "medium", "cumulative": "nesting", "bands": "nesting"}
+    fields |= {"next": "leftover", "ignore": "leftover"}
+    if base != "vkitti2" or not set(options) <= set(fields):
+        raise ValueError(f"difficulty: expected kitti or vkitti2[:{'|'.join(fields)}]..., got {name!r}")
+    return Vkitti2Difficulty(**{fields[option]: option for option in options})

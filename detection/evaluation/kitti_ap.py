@@ -12,9 +12,9 @@ from functools import cached_property
 from typing import Any, TypedDict
 
 from detection.evaluation.curves import RECALL_POINTS, Curve, average_precision, curve_of, exact_ap
-from detection.evaluation.difficulty import LEVELS, DifficultyRule, KittiDifficulty, Vkitti2Difficulty
+from detection.evaluation.difficulty import LEVELS, DifficultyRule, Vkitti2Difficulty, difficulty_named
 from detection.evaluation.matching import MatchRecords
-from detection.evaluation.objects import FrameObjects
+from detection.evaluation.objects import OCCLUDED, TRUNCATED, FrameObjects
 from detection.evaluation.protocol import EVERYWHERE, METRICS, Matcher, Range, Target, levels, targets_of
 from detection.evaluation.reading import PathLike, read_pair
 
@@ -119,16 +119,28 @@ class Evaluation:
             "recall": [self._side_row(target, found_share) for target in self.targets if target.metric != "aos"],
             "warnings": [*small_set_warnings(rows), *(message for _, message in problems)],
             "skipped": {kind: sum(1 for found, _ in problems if found == kind) for kind, _ in problems},
-            "protocol": {
-                "flavor": matcher.flavor,
-                "difficulty": type(matcher.difficulty).__name__,
-                "range_rule": matcher.range_rule,
-                "range_axis": matcher.range_axis,
-                "frames": len(matcher.pair.frames),
-                "labels": len(matcher.pair.labels),
-                "detections": len(matcher.pair.detections),
-            },
+            "protocol": self._protocol(),
         }
+
+    def _protocol(self) -> dict[str, Any]:
+        matcher = self.matcher
+        labels = matcher.pair.labels
+        protocol: dict[str, Any] = {
+            "flavor": matcher.flavor,
+            "difficulty": str(matcher.difficulty),
+            "range_rule": matcher.range_rule,
+            "range_axis": matcher.range_axis,
+            "frames": len(matcher.pair.frames),
+            "labels": len(labels),
+            "detections": len(matcher.pair.detections),
+        }
+        if isinstance(matcher.difficulty, Vkitti2Difficulty):
+            columns = (labels.height_2d, labels.values[:, TRUNCATED], labels.values[:, OCCLUDED])
+            protocol["objects_per_level"] = {
+                cls: matcher.difficulty.level_counts(*(column[labels.is_type(cls)] for column in columns))
+                for cls in dict.fromkeys(target.cls for target in self.targets)
+            }
+        return protocol
 
     def _side_row(self, target: Target, value: Any) -> dict[str, Any]:
         known = self.matcher.is_evaluated(target)
@@ -160,7 +172,7 @@ def small_set_warnings(rows: Sequence[ApRow]) -> list[str]:
             cap = max(n - 1, 0) / 40 if row["recall_points"] == 40 else ((n - 1) // 4 + 1) / 11
             sentences[
                 f"{row['class']} {level}{where}: only {n} objects count; with fewer than 41 even a perfect detector "
-                f"gets AP {100 * cap:.1f} of 100 (R{row['recall_points']}). Do not compare this number; see the exact AP"
+                f"gets AP {100 * cap:.1f} of 100 (R{row['recall_points']}). Do not compare it; see the exact AP"
             ] = None
     return list(sentences)
 
@@ -173,7 +185,7 @@ def prepare(
     metrics: Sequence[str] = METRICS,
     recall: int = 40,
     iou_set: str = "both",
-    ious: Mapping[str, float] | None = None,
+    ious: Mapping[str, Sequence[float]] | None = None,
     flavor: str = "cpp",
     ranges: Sequence[Range] = (EVERYWHERE,),
     range_rule: str = "clocs",
@@ -185,13 +197,9 @@ def prepare(
 ) -> Evaluation:
     """Read both sides and set up the evaluation; the arguments are those of `evaluate`."""
     targets = targets_of(classes, iou_set, ious or {}, ranges, metrics)
-    if isinstance(difficulty, str):
-        rules: dict[str, DifficultyRule] = {"kitti": KittiDifficulty(flavor), "vkitti2": Vkitti2Difficulty()}
-        if difficulty not in rules:
-            raise ValueError(f"difficulty: expected one of {', '.join(rules)}, got {difficulty!r}")
-        difficulty = rules[difficulty]
+    rule = difficulty_named(difficulty, flavor) if isinstance(difficulty, str) else difficulty
     pair = read_pair(labels, detections, frames=frames, missing=missing, lenient=lenient)
-    return Evaluation(Matcher(pair, flavor, range_rule, range_axis, difficulty), targets, recall)
+    return Evaluation(Matcher(pair, flavor, range_rule, range_axis, rule), targets, recall)
 
 
 def evaluate(
@@ -202,7 +210,7 @@ def evaluate(
     metrics: Sequence[str] = METRICS,
     recall: int = 40,
     iou_set: str = "both",
-    ious: Mapping[str, float] | None = None,
+    ious: Mapping[str, Sequence[float]] | None = None,
     flavor: str = "cpp",
     ranges: Sequence[Range] = (EVERYWHERE,),
     range_rule: str = "clocs",
@@ -220,14 +228,15 @@ def evaluate(
     metrics     some of "2d", "aos", "bev", "3d"
     recall      40 or 11 recall points
     iou_set     "strict" (Car 0.7, others 0.5), "loose" (bev and 3d: 0.5 and 0.25) or "both"
-    ious        class -> IoU that replaces the sets for that class
+    ious        class -> IoUs that replace the sets for that class, as {"Car": [0.3, 0.5, 0.7]}
     flavor      "cpp": the official devkit; "python": the widely used port (a label exactly 40 or 25 px high is ignored,
                 DontCare is written so and known in the image only, AOS is judged by the first detection)
     ranges      pairs (lo, hi) in metres, lo <= distance < hi, hi None = no limit; (0, None) = everything
     range_rule  "clocs": labels outside are ignored, detections outside dropped; "border": a detection outside that
                 overlaps a label inside still counts, and others outside are ignored
     range_axis  "z": depth along the optical axis; "radius": distance on the ground
-    difficulty  "kitti", "vkitti2" or a DifficultyRule
+    difficulty  "kitti", "vkitti2" (columns truncated and occluded hold ratios 0..1), "vkitti2:and:bands:ignore" and
+                the like (see Vkitti2Difficulty), or a DifficultyRule
     frames      frames to evaluate (a split); None = every labelled frame
     missing     a frame without result file: "error", "skip" (as the official offline tool) or "empty"
     lenient     pass over broken lines, missing files and results of unknown frames; counted in "skipped"

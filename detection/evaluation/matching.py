@@ -86,7 +86,6 @@ def record_matches(
 
 
 def match_all(
-    label_offsets: Index,
     overlaps: Overlaps,
     label_flag: Flags,
     detection_flag: Flags,
@@ -96,10 +95,21 @@ def match_all(
     """(G,) the detection row each label gets in pass B when every detection is admitted, -1 for none."""
     match = np.full(len(label_flag), -1, dtype=np.int64)
     taken = np.zeros(len(detection_flag), dtype=np.bool_)
-    pairs = (overlaps.start, overlaps.detection, overlaps.iou)
-    for f in range(len(label_offsets) - 1):
-        rows = (label_offsets[f], label_offsets[f + 1])
-        _match_at(-np.finfo(np.float64).max, *rows, *pairs, min_overlap, label_flag, detection_flag, scores, taken, match)
+    # A pair lies within one frame, so the labels of all frames can be walked at once.
+    _match_at(
+        float(-np.finfo(np.float64).max),
+        0,
+        len(label_flag),
+        overlaps.start,
+        overlaps.detection,
+        overlaps.iou,
+        min_overlap,
+        label_flag,
+        detection_flag,
+        scores,
+        taken,
+        match,
+    )
     return match
 
 

@@ -51,7 +51,7 @@ def overlaps_of(
 
 
 def _unsigned(boxes: Array) -> Array:
-    """Boxes with positive w and l: DontCare and 2D-only lines carry -1, for the devkit's polygons the same rectangle."""
+    """Boxes with positive w and l: DontCare and 2D-only lines carry -1, the same rectangle to the devkit."""
     boxes[:, 4:6] = np.abs(boxes[:, 4:6])
     return boxes
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from detection.evaluation.difficulty import DifficultyRule, KittiDifficulty
 from detection.evaluation.matching import IGNORED, INVISIBLE, VALID, Flags, MatchRecords, record_matches
-from detection.evaluation.objects import X, Y, Z, Mask, ObjectTable
+from detection.evaluation.objects import Mask, ObjectTable, X, Y, Z
 from detection.evaluation.overlaps import Overlaps, overlaps_of
 from detection.evaluation.reading import FramePair
 
@@ -52,27 +52,35 @@ def min_overlap(cls: str, metric: str, iou_set: str) -> float:
 
 
 def targets_of(
-    classes: Sequence[str], iou_set: str, ious: Mapping[str, float], ranges: Sequence[Range], metrics: Sequence[str]
+    classes: Sequence[str],
+    iou_set: str,
+    ious: Mapping[str, Sequence[float]],
+    ranges: Sequence[Range],
+    metrics: Sequence[str],
 ) -> tuple[Target, ...]:
     """Every row asked for, each once (image rows of the strict and loose set are the same).
 
-    ious  class -> IoU that replaces the sets for that class. Raises ValueError for what cannot be asked.
+    ious  class -> IoUs that replace the sets for that class. Raises ValueError for what cannot be asked.
     """
     _check_request(classes, iou_set, ious, ranges, metrics)
     sets = ("strict", "loose") if iou_set == "both" else (iou_set,)
-    own = {name.lower(): value for name, value in ious.items()}
+    own = {name.lower(): values for name, values in ious.items()}
     rows = [
-        Target(cls, metric, own.get(cls.lower(), min_overlap(cls, metric, which)), bounds)
+        Target(cls, metric, min_overlap(cls, metric, limit) if isinstance(limit, str) else float(limit), bounds)
         for bounds in ranges
         for cls in classes
-        for which in sets
+        for limit in own.get(cls.lower(), sets)
         for metric in metrics
     ]
     return tuple(dict.fromkeys(rows))
 
 
 def _check_request(
-    classes: Sequence[str], iou_set: str, ious: Mapping[str, float], ranges: Sequence[Range], metrics: Sequence[str]
+    classes: Sequence[str],
+    iou_set: str,
+    ious: Mapping[str, Sequence[float]],
+    ranges: Sequence[Range],
+    metrics: Sequence[str],
 ) -> None:
     if isinstance(classes, str) or not classes:
         raise ValueError(f"classes: expected a list of class names, got {classes!r}")
@@ -80,11 +88,12 @@ def _check_request(
         raise ValueError("classes: DontCare marks areas and cannot be evaluated")
     if iou_set not in IOU_SETS:
         raise ValueError(f"IoU set: expected one of {', '.join(IOU_SETS)}, got {iou_set!r}")
-    for name, value in ious.items():
+    for name, values in ious.items():
         if name.lower() not in {cls.lower() for cls in classes}:
             raise ValueError(f"IoU of {name}: that class is not evaluated ({', '.join(classes)} are)")
-        if not 0 <= value < 1:
-            raise ValueError(f"IoU of {name}: expected 0 <= IoU < 1 (a match needs more than it), got {value}")
+        impossible = [value for value in values if not 0 <= value < 1]
+        if impossible:
+            raise ValueError(f"IoU of {name}: expected 0 <= IoU < 1 (a match needs more than it), got {impossible[0]}")
     for lo, hi in ranges:
         if hi is not None and not lo < hi:
             raise ValueError(f"range: expected LO < HI in metres, got {lo} {hi}")

@@ -1,0 +1,260 @@
+"""`--stage evaluate`: KITTI AP of any two folders of label and result files."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+if TYPE_CHECKING:
+    from detection.evaluation.bootstrap import Resampling
+    from detection.evaluation.kitti_ap import Evaluation, Report
+    from detection.evaluation.protocol import Range
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of this verb."""
+    parser.add_argument("--labels", required=True, metavar="DIR", help="KITTI label files (label_2)")
+    parser.add_argument("--detections", required=True, metavar="DIR", help="KITTI result files, one per frame")
+    parser.add_argument("--split", metavar="FILE", help="names of the frames to evaluate (every labelled frame)")
+    parser.add_argument("--classes", default="Car,Pedestrian,Cyclist", metavar="Car,...")
+    parser.add_argument("--metrics", default="2d,aos,bev,3d", metavar="2d,...")
+    parser.add_argument("--recall", type=int, choices=(40, 11), default=40, help="recall points (40)")
+    parser.add_argument("--iou-set", choices=("strict", "loose", "both"), default="both")
+    parser.add_argument(
+        "--iou", action="append", default=[], metavar="CLASS=IOU", help="instead of the sets; may be repeated"
+    )
+    parser.add_argument("--flavor", choices=("cpp", "python"), default="cpp", help="official devkit or the Python port")
+    parser.add_argument(
+        "--range",
+        nargs=2,
+        type=float,
+        action="append",
+        dest="ranges",
+        metavar=("LO", "HI"),
+        help="only LO <= z < HI metres (HI may be inf); may be repeated",
+    )
+    parser.add_argument(
+        "--range-rule",
+        choices=("clocs", "border"),
+        default="clocs",
+        help="detections outside: dropped, or kept where they find a label inside",
+    )
+    parser.add_argument("--range-axis", choices=("z", "radius"), default="z", help="depth or distance on the ground")
+    parser.add_argument(
+        "--difficulty",
+        default="kitti",
+        metavar="RULE",
+        help="kitti, or vkitti2 with options as vkitti2:and:bands:ignore (docs/evaluation.md)",
+    )
+    parser.add_argument(
+        "--missing",
+        choices=("error", "skip", "empty"),
+        default="error",
+        help="a frame without result file: error, leave it out as the official tool, or nothing found",
+    )
+    parser.add_argument("--lenient", action="store_true", help="pass over broken lines and missing files; count them")
+    parser.add_argument("--explain", action="store_true", help="say why every object is matched, missed or ignored")
+    parser.add_argument("--bootstrap", type=int, metavar="N", help="confidence intervals from N resamples of frames")
+    parser.add_argument("--confidence", type=float, default=0.95, help="of the intervals (0.95)")
+    parser.add_argument("--bootstrap-seed", type=int, default=0)
+    parser.add_argument(
+        "--compare",
+        action="append",
+        default=[],
+        metavar="[NAME=]DIR",
+        help="another result folder; paired bootstrap differences to --detections; may be repeated",
+    )
+    parser.add_argument("--curves", metavar="DIR", help="write precision-recall curves and score histograms")
+    parser.add_argument("--json", metavar="FILE", help="write the results as JSON; - for stdout")
+    parser.add_argument("--markdown", metavar="FILE", help="write the table as Markdown; - for stdout")
+    parser.add_argument("--latex", metavar="FILE", help="write the table as LaTeX; - for stdout")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Evaluate and print the table; 0 done, 2 the request cannot be carried out (one line on stderr)."""
+    try:
+        return _run(args)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+def _run(args: argparse.Namespace) -> int:
+    from detection.evaluation.tables import latex_table, markdown_table
+
+    evaluation = _prepare(args, args.detections)
+    report = evaluation.report()
+    others = {name: _prepare(args, folder) for name, folder in _named_folders(args.compare, args.detections)}
+    # Whoever asks for a machine-readable stdout gets nothing else on it.
+    screen = sys.stderr if "-" in (args.json, args.markdown, args.latex) else sys.stdout
+    print(markdown_table(report), file=screen)
+    result: dict[str, Any] = dict(report)
+    if args.bootstrap is not None or others:
+        result |= _resample(args, evaluation, others, screen)
+    for message in report["warnings"]:
+        print(f"WARNING: {message}", file=sys.stderr)
+    causes = _causes(evaluation, report)
+    for cause in causes:
+        print(f"LIKELY CAUSE: {cause}", file=sys.stderr)
+    result["causes"] = causes
+    if args.explain:
+        _explain(evaluation, screen)
+    if args.curves:
+        from detection.evaluation.plots import write_curves
+
+        for path in write_curves(evaluation, Path(args.curves)):
+            print(f"wrote {path}", file=screen)
+    _write(args.json, lambda: json.dumps(result, indent=1, allow_nan=False) + "\n")
+    _write(args.markdown, lambda: markdown_table(report))
+    _write(args.latex, lambda: latex_table(report["results"]))
+    return 0
+
+
+def _prepare(args: argparse.Namespace, detections: str) -> Evaluation:
+    from detection.evaluation.kitti_ap import prepare
+    from detection.evaluation.protocol import EVERYWHERE
+    from detection.evaluation.reading import read_split
+
+    ranges: Sequence[Range] = [(lo, None if math.isinf(hi) else hi) for lo, hi in args.ranges or []]
+    return prepare(
+        args.labels,
+        detections,
+        classes=[name.strip() for name in args.classes.split(",") if name.strip()],
+        metrics=[name.strip().lower() for name in args.metrics.split(",") if name.strip()],
+        recall=args.recall,
+        iou_set=args.iou_set,
+        ious=_class_ious(args.iou),
+        flavor=args.flavor,
+        ranges=ranges or [EVERYWHERE],
+        range_rule=args.range_rule,
+        range_axis=args.range_axis,
+        difficulty=args.difficulty,
+        frames=read_split(args.split) if args.split else None,
+        missing=args.missing,
+        lenient=args.lenient,
+    )
+
+
+def _class_ious(texts: Sequence[str]) -> dict[str, list[float]]:
+    """Class -> IoUs from texts such as Car=0.7."""
+    ious: dict[str, list[float]] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            ious.setdefault(name, []).append(float(value))
+        except ValueError:
+            raise ValueError(f"--iou: expected CLASS=IOU such as Car=0.7, got {text!r}") from None
+    return ious
+
+
+def _named_folders(compare: Sequence[str], baseline: str) -> list[tuple[str, str]]:
+    """(name, folder) of every --compare; the name is the folder's where none is given."""
+    named = []
+    for text in compare:
+        name, separator, folder = text.partition("=")
+        named.append((name, folder) if separator else (Path(text).name, text))
+    names = [name for name, _ in named] + [Path(baseline).name]
+    if len(set(names)) != len(names):
+        raise ValueError(f"--compare: two result folders are called the same ({', '.join(names)}); use NAME=DIR")
+    return named
+
+
+def _resample(
+    args: argparse.Namespace, evaluation: Evaluation, others: dict[str, Evaluation], screen: TextIO
+) -> dict[str, Any]:
+    """Intervals of the baseline, and the differences of the others to it."""
+    from detection.evaluation.bootstrap import Resampling, confidence_intervals, paired_differences
+    from detection.evaluation.tables import difference_table, interval_table
+
+    resampling: Resampling = Resampling(
+        1000 if args.bootstrap is None else args.bootstrap, args.bootstrap_seed, args.confidence
+    )
+    intervals = confidence_intervals(evaluation, resampling)
+    print(interval_table(intervals, resampling.confidence), file=screen)
+    found: dict[str, Any] = {"resampling": asdict(resampling), "intervals": [_flat(item) for item in intervals]}
+    if others:
+        differences = paired_differences({Path(args.detections).name: evaluation, **others}, resampling)
+        print(difference_table(differences, resampling.confidence), file=screen)
+        found["differences"] = [_flat(item) for item in differences]
+    return found
+
+
+def _flat(item: Any) -> dict[str, Any]:
+    """A row with its target's fields beside its own, named as in the results."""
+    row = asdict(item)
+    target = row.pop("target")
+    return {
+        "class": target["cls"],
+        "metric": target["metric"],
+        "iou": target["iou"],
+        "range": list(target["range"]),
+        **row,
+    }
+
+
+def _causes(evaluation: Evaluation, report: Report) -> list[str]:
+    """Likely causes for every class whose moderate AP is next to nothing, each once."""
+    from detection.evaluation.diagnose import likely_causes
+
+    causes: dict[str, None] = {}
+    for target, row in zip(evaluation.targets, report["results"]):
+        if target.metric != "aos" and (row["moderate"] is None or row["moderate"] < 1):
+            causes.update(dict.fromkeys(likely_causes(evaluation.matcher, target)))
+    return list(causes)
+
+
+def _explain(evaluation: Evaluation, screen: TextIO) -> None:
+    """Every object at moderate, for the last metric asked for of each class and range at its strictest IoU."""
+    from detection.evaluation.explain import explain, orientation_errors, sum_reasons
+    from detection.evaluation.tables import METRIC_NAMES, range_text
+
+    metric = evaluation.targets[-1].metric
+    for cls, bounds in dict.fromkeys((target.cls, target.range) for target in evaluation.targets):
+        candidates = [t for t in evaluation.targets if (t.cls, t.range, t.metric) == (cls, bounds, metric)]
+        target = max(candidates, key=lambda t: t.iou)
+        lines = explain(evaluation.matcher, target, level=1)
+        for line in lines:
+            print(line, file=screen)
+        where = f"{cls} {METRIC_NAMES[metric]} IoU > {target.iou:g}, {range_text(bounds)}, moderate, any score"
+        print(f"\nReasons for {where}", file=screen)
+        for side, status, reason, count in sum_reasons(lines):
+            print(f"{count:7d}  {side} {status}: {reason}", file=screen)
+        errors = orientation_errors(evaluation.matcher, target, level=1)
+        if errors is not None:
+            print(
+                f"Orientation of the matched: mean error {errors[0]:.1f} deg, {errors[1]:.1f} % turned by over 90",
+                file=screen,
+            )
+        print(file=screen)
+
+
+def _write(place: str | None, text: Callable[[], str]) -> None:
+    """Write to a file by atomic rename, or to stdout for "-"."""
+    if place is None:
+        return
+    if place == "-":
+        sys.stdout.write(text())
+        return
+    path = Path(place)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    partial.write_text(text(), encoding="utf-8")
+    os.replace(partial, path)
+
+
+def main() -> int:
+    """`python -m pipeline.verbs.evaluate`."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    add_arguments(parser)
+    return run(parser.parse_args())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

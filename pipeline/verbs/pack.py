@@ -1,0 +1,53 @@
+"""`--stage pack`: a submission archive for the KITTI object server, checked against its rules."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from detection.evaluation.submission import TEST_FRAMES, check_submission, write_archive
+
+_SHOWN = 20
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of this verb."""
+    parser.add_argument("--detections", required=True, metavar="DIR", help="folder of result files 000000.txt ...")
+    parser.add_argument("--archive", default="submission.zip", metavar="FILE", help="zip to write (submission.zip)")
+    parser.add_argument(
+        "--test-frames",
+        type=int,
+        default=TEST_FRAMES,
+        metavar="N",
+        help=f"frames of the test split, numbered from 0 ({TEST_FRAMES})",
+    )
+    parser.add_argument("--fill-missing", action="store_true", help="add empty files for frames without a result file")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Check and pack; 0 written, 2 refused (every reason on stderr)."""
+    folder = Path(args.detections)
+    errors, warnings = check_submission(folder, args.test_frames, args.fill_missing)
+    for message in warnings:
+        print(f"warning: {message}", file=sys.stderr)
+    if errors:
+        for message in errors[:_SHOWN]:
+            print(f"error: {message}", file=sys.stderr)
+        if len(errors) > _SHOWN:
+            print(f"error: ... and {len(errors) - _SHOWN} more", file=sys.stderr)
+        return 2
+    archive = write_archive(folder, Path(args.archive), args.test_frames)
+    print(f"{archive}: {args.test_frames} result files at the root, {archive.stat().st_size / 1e6:.1f} MB")
+    return 0
+
+
+def main() -> int:
+    """`python -m pipeline.verbs.pack`."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    add_arguments(parser)
+    return run(parser.parse_args())
+
+
+if __name__ == "__main__":
+    sys.exit(main())
