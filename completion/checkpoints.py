@@ -18,16 +18,24 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
-from torch import Tensor, nn
+from torch import nn
 
+from completion.importers import import_checkpoint, import_with_spec
 from completion.models import ModelSpec, build_model
+from completion.readout import default_read_out
+from completion.state_dicts import CheckpointError, fill
+
+__all__ = [
+    "Card",
+    "CheckpointError",
+    "convert_checkpoint",
+    "import_checkpoint",
+    "load_checkpoint",
+    "save_checkpoint",
+]
 
 FORMAT = "auglidar-completion-1"
 WEIGHTS = Path(__file__).resolve().parent / "weights"
-
-
-class CheckpointError(ValueError):
-    """A weights file that cannot be used: which file, what was expected, what came."""
 
 
 @dataclass(frozen=True)
@@ -125,17 +133,7 @@ def load_checkpoint(path_or_name: str | Path) -> tuple[nn.Module, Card]:
     return model.eval(), card
 
 
-def fill(model: nn.Module, tensors: Mapping[str, Tensor], where: str) -> None:
-    """Copy tensors into the model in place. CheckpointError naming every missing, unknown or misshapen one."""
-    own = model.state_dict()
-    problems = [f"missing {name}" for name in own if name not in tensors]
-    problems += [f"unknown {name}" for name in tensors if name not in own]
-    problems += [
-        f"{name} is {tuple(tensors[name].shape)}, the network has {tuple(value.shape)}"
-        for name, value in own.items()
-        if name in tensors and tensors[name].shape != value.shape
-    ]
-    if problems:
-        shown = "; ".join(problems[:6]) + (f"; and {len(problems) - 6} more" if len(problems) > 6 else "")
-        raise CheckpointError(f"{where}: does not fit this network ({len(own)} tensors): {shown}")
-    model.load_state_dict(dict(tensors))
+def convert_checkpoint(path: str | Path, architecture: str, out: str | Path) -> Path:
+    """Import a published file (see `import_checkpoint`) and write it as our safetensors with a card; returns its path."""
+    model, spec, facts = import_with_spec(path, architecture)
+    return save_checkpoint(out, model, Card(spec, default_read_out(spec), facts))

@@ -115,14 +115,14 @@ POOLING_RULES = ("average", "minimum", "maximum", "nearest")
 def pool_target(target: Tensor, factor: int, rule: str = "average") -> Tensor:
     """Target (B, 1, H, W), 0 = none -> (B, 1, H/factor, W/factor) over valid pixels, 0 where a block has none.
 
-    rule  "average" (invents depths at edges), "minimum", "maximum", or "nearest" (the block's first pixel)
+    rule  "average" (invents depths at edges), "minimum", "maximum", or "nearest" (the block's first valid pixel)
     """
     if rule not in POOLING_RULES:
         raise ValueError(f"pooling rule: expected one of {', '.join(POOLING_RULES)}, got {rule!r}")
     if factor == 1:
         return target
     if rule == "nearest":
-        return target[..., ::factor, ::factor]
+        return _first_valid(target, factor)
     if rule == "maximum":
         return F.max_pool2d(target, factor)
     valid = (target > 0).to(target.dtype)
@@ -132,6 +132,12 @@ def pool_target(target: Tensor, factor: int, rule: str = "average") -> Tensor:
     far = torch.where(target > 0, -target, torch.full_like(target, -torch.inf))
     pooled = -F.max_pool2d(far, factor)
     return torch.where(torch.isfinite(pooled), pooled, torch.zeros_like(pooled))
+
+
+def _first_valid(target: Tensor, factor: int) -> Tensor:
+    blocks = F.pixel_unshuffle(target, factor)
+    first = (blocks > 0).to(torch.uint8).argmax(1, keepdim=True)
+    return blocks.gather(1, first)
 
 
 def depth_edges(target: Tensor, window: int = 5, ratio: float = 1.1, step: float = 1.0) -> Tensor:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from completion import losses
+from completion.depth_coefficients import Bins, cross_entropy
 from completion.models import ModelSpec
 
 OBJECTIVES = ("twin", "l1", "l2", "l1_l2", "huber", "dc")
@@ -91,7 +91,7 @@ def training_loss(
     """
     weights = pixel_weights(sparse, target, objective)
     if objective.kind == "dc":
-        return _coefficient_parts(outputs, target, weights, objective)
+        return _coefficient_parts(outputs, target, weights, spec.bins, objective)
     parts: dict[str, Tensor] = {}
     total = torch.zeros((), device=target.device)
     for number, (output, scale_weight) in enumerate(zip(outputs, scale_weights)):
@@ -124,17 +124,14 @@ def _parts(
 
 
 def _coefficient_parts(
-    outputs: tuple[Tensor, ...], target: Tensor, weights: Tensor, objective: Objective
+    outputs: tuple[Tensor, ...], target: Tensor, weights: Tensor, bins: Bins, objective: Objective
 ) -> dict[str, Tensor]:
     """Cross-entropy at full resolution, and of further outputs against the target's first valid pixel per block."""
-    from completion.depth_coefficients import cross_entropy
-
-    main = cross_entropy(outputs[0].float(), target, weights)
+    main = cross_entropy(outputs[0].float(), target, weights, bins)
     parts, total = {"entropy": main}, main
     for number, output in enumerate(outputs[1:], start=1):
-        size = output.shape[-2:]
-        small = F.interpolate(target, size=size, mode="nearest")
-        found = cross_entropy(output.float(), small, losses.valid_weights(small))
+        small = losses.pool_target(target, target.shape[-1] // output.shape[-1], "nearest")
+        found = cross_entropy(output.float(), small, losses.valid_weights(small), bins)
         parts[f"entropy_{number}"] = found
         total = total + objective.auxiliary * found
     return parts | {"loss": total}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from completion.depth_coefficients import decode_logits
 from completion.models import ModelSpec
 from completion.twin_surface import READ_OUTS, fuse, split_head
 
@@ -31,6 +32,4 @@ def read_output(output: Tensor, spec: ModelSpec, read_out: str) -> Maps:
         return fuse(foreground, background, sigma, read_out), foreground, background, sigma
     if spec.output == "depth":
         return output[:, 0].float().clamp(min=0) * spec.depth_unit, None, None, None
-    from completion.depth_coefficients import decode_logits
-
-    return decode_logits(output.float(), read_out), None, None, None
+    return decode_logits(output.float(), spec.bins, read_out), None, None, None

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from torch import nn
 
+from completion.depth_coefficients import Bins
+from completion.models.coefficients import CoefficientNetwork, CoefficientSparseToDense
 from completion.models.guided import Guided
 from completion.models.hourglass import MultiStack, Twise
+from completion.models.sparse_to_dense import SparseToDense, TwinSparseToDense
 
 RGB_SCALINGS = ("unit", "standardised", "raw")
 OUTPUTS = ("twin", "depth", "coefficients")
@@ -44,6 +48,12 @@ class ModelSpec:
         if not self.depth_unit > 0:
             raise ValueError(f"depth_unit: expected metres > 0, got {self.depth_unit}")
 
+    @property
+    def bins(self) -> Bins:
+        """Depth bins of a network with output "coefficients", from its builder's arguments."""
+        chosen = {name: self.arguments[name] for name in ("count", "size", "layout") if name in self.arguments}
+        return Bins(**chosen)
+
 
 @dataclass(frozen=True)
 class Entry:
@@ -59,6 +69,18 @@ class Entry:
 MODELS: dict[str, Entry] = {
     "twise": Entry(Twise, 80.0, "unit", "twin", 16),
     "msg_chn": Entry(MultiStack, 1.0, "unit", "depth", 16),
+    "sparse_to_dense": Entry(SparseToDense, 1.0, "raw", "depth", 16),
+    "twise_resnet": Entry(TwinSparseToDense, 80.0, "unit", "twin", 16),
+    "depth_coefficients": Entry(CoefficientNetwork, 1.0, "unit", "coefficients", 16),
+    # The 2x2 of thesis Table 3.3: sparse depth or coefficients in, metres or coefficients out, on one backbone.
+    "resnet_depth_to_depth": Entry(
+        partial(CoefficientSparseToDense, coefficient_input=False, coefficient_head=False), 1.0, "unit", "depth", 16
+    ),
+    "resnet_dc_to_depth": Entry(partial(CoefficientSparseToDense, coefficient_head=False), 1.0, "unit", "depth", 16),
+    "resnet_depth_to_dc": Entry(
+        partial(CoefficientSparseToDense, coefficient_input=False), 1.0, "unit", "coefficients", 16
+    ),
+    "resnet_dc_to_dc": Entry(CoefficientSparseToDense, 1.0, "unit", "coefficients", 16),
     "guided": Entry(Guided, 1.0, "standardised", "twin", 64),
 }
 

@@ -1,0 +1,114 @@
+"""The sparse-to-dense ResNet of Ma, Cavalheiro, Karaman, "Self-Supervised Sparse-to-Dense" (ICRA 2019), 18 or 34 layers.
+
+Layer names are those of the published state dictionary. Heads: one channel in metres, three for twin surfaces on the
+same backbone (thesis Table 4.5), or N logits (Table 3.3).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from completion.models.blocks import require_multiple
+from completion.models.resnet import block_counts, resnet_layer
+
+SCALE = 100.0  # metres per unit of the published head
+SHALLOWEST = 0.9  # metres; the published evaluation never predicts less
+
+
+def _normalised(convolution: nn.Module, channels: int) -> nn.Sequential:
+    return nn.Sequential(convolution, nn.BatchNorm2d(channels), nn.LeakyReLU(0.2))
+
+
+def _input(inputs: int, outputs: int) -> nn.Sequential:
+    return _normalised(nn.Conv2d(inputs, outputs, 3, padding=1, bias=False), outputs)
+
+
+def _up(inputs: int, outputs: int, stride: int = 2) -> nn.Sequential:
+    up = nn.ConvTranspose2d(inputs, outputs, 3, stride, padding=1, output_padding=stride - 1, bias=False)
+    return _normalised(up, outputs)
+
+
+class Backbone(nn.Module):
+    """(B, D, H, W) depth and (B, 3 or 1, H, W) image -> (B, heads, H, W), H and W multiples of 16.
+
+    depth_channels  input channels of the depth branch (1, or the bins of Depth Coefficients)
+    grey            the image is one grey channel (published "gd" models); both branches then have 32 features
+    """
+
+    def __init__(self, layers: int, heads: int, depth_channels: int = 1, grey: bool = False) -> None:
+        super().__init__()
+        blocks = block_counts(layers)
+        depth_width, image_width = (32, 32) if grey else (16, 48)
+        self.grey = grey
+        self.conv1_d = _input(depth_channels, depth_width)
+        self.conv1_img = _input(1 if grey else 3, image_width)
+        self.conv2 = resnet_layer(64, 64, blocks[0], 1)
+        self.conv3 = resnet_layer(64, 128, blocks[1], 2)
+        self.conv4 = resnet_layer(128, 256, blocks[2], 2)
+        self.conv5 = resnet_layer(256, 512, blocks[3], 2)
+        self.conv6 = _normalised(nn.Conv2d(512, 512, 3, stride=2, padding=1, bias=False), 512)
+        self.convt5 = _up(512, 256)
+        self.convt4 = _up(768, 128)
+        self.convt3 = _up(384, 64)
+        self.convt2 = _up(192, 64)
+        self.convt1 = _up(128, 64, stride=1)
+        self.convtf = nn.Conv2d(128, heads, 1)
+        self._initialise()
+
+    def _initialise(self) -> None:
+        """N(0, 0.001) for every convolution, as published for networks without pretrained weights; BN 1 and 0."""
+        for layer in self.modules():
+            if isinstance(layer, (nn.Conv2d, nn.ConvTranspose2d)):
+                nn.init.normal_(layer.weight, std=1e-3)
+                if layer.bias is not None:
+                    nn.init.zeros_(layer.bias)
+
+    def decode(self, depth: Tensor, image: Tensor) -> Tensor:
+        """The head's raw values."""
+        conv1 = torch.cat((self.conv1_d(depth), self.conv1_img(image)), 1)
+        conv2 = self.conv2(conv1)
+        conv3 = self.conv3(conv2)
+        conv4 = self.conv4(conv3)
+        conv5 = self.conv5(conv4)
+        conv6 = self.conv6(conv5)
+        y = torch.cat((self.convt5(conv6), conv5), 1)
+        y = torch.cat((self.convt4(y), conv4), 1)
+        y = torch.cat((self.convt3(y), conv3), 1)
+        y = torch.cat((self.convt2(y), conv2), 1)
+        y = torch.cat((self.convt1(y), conv1), 1)
+        head: Tensor = self.convtf(y)
+        return head
+
+    def colours(self, rgb: Tensor) -> Tensor:
+        """RGB (B, 3, H, W) as the image branch takes it: itself, or its luma (ITU-R 601)."""
+        if not self.grey:
+            return rgb
+        return 0.299 * rgb[:, 0:1] + 0.587 * rgb[:, 1:2] + 0.114 * rgb[:, 2:3]
+
+
+class SparseToDense(Backbone):
+    """`forward(sparse in metres, rgb in 0..255) -> (B, 1, H, W)` metres.
+
+    In training mode 100 times the head; in evaluation mode relu(100 y - 0.9) + 0.9, so never below 0.9 m.
+    """
+
+    def __init__(self, layers: int = 18, grey: bool = False) -> None:
+        super().__init__(layers, heads=1, grey=grey)
+
+    def forward(self, sparse: Tensor, rgb: Tensor) -> Tensor:
+        require_multiple(sparse, rgb, 16)
+        metres = SCALE * self.decode(sparse, self.colours(rgb))
+        return metres if self.training else F.relu(metres - SHALLOWEST) + SHALLOWEST
+
+
+class TwinSparseToDense(Backbone):
+    """TWISE on ResNet: `forward(sparse / 80, rgb / 255) -> (out,)`, out (B, 3, H, W): surfaces / 80 m, sigma logit."""
+
+    def __init__(self, layers: int = 18, grey: bool = False) -> None:
+        super().__init__(layers, heads=3, grey=grey)
+
+    def forward(self, sparse: Tensor, rgb: Tensor) -> tuple[Tensor]:
+        require_multiple(sparse, rgb, 16)
+        return (self.decode(sparse, self.colours(rgb)),)
