@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +88,7 @@ def point_features(cloud: CameraCloud, height: NDArray[np.float32], names: Seque
     semantic   the frame's last column, a 0 / 1 flag (thesis 5.3)
     Raises ValueError naming the column a frame lacks.
     """
-    columns: list[NDArray[np.float32]] = []
+    columns: list[NDArray[Any]] = []
     for name in names:
         if name == "height":
             columns.append(np.clip(height / 2, -0.5, 2.0))

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class AdamOneCycle:
     def __init__(self, model: nn.Module, steps: int, settings: OneCycleSettings) -> None:
         self.settings, self.steps = settings, steps
         self.names = [name for name, parameter in model.named_parameters() if parameter.requires_grad]
-        self.parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
+        self.parameters: list[Tensor] = [parameter for parameter in model.parameters() if parameter.requires_grad]
         self.adam = torch.optim.Adam(self.parameters, lr=settings.peak, betas=(settings.momentum[0], 0.99))
 
     def step(self, step: int) -> float:

@@ -14,7 +14,7 @@ Index = NDArray[np.int64]
 
 
 def near_far_sample(points: NDArray[Any], count: int, rng: np.random.Generator, far: float = 40.0) -> Index:
-    """(count,) indices by PointRCNN's rule: all points with z >= `far` metres, the rest from those nearer.
+    """(count,) indices by PointRCNN's rule: all points with z >= `far` metres, the rest from nearer ones.
 
     points  (N, 3+) rectified camera frame, N >= 1
     With fewer points than `count`, all of them and duplicates (without replacement while N >= count / 2, with it below).

@@ -363,23 +363,32 @@ def train(
 def _train_worker(rank: int, count: int, port: int, arguments: tuple[Any, ...]) -> None:
     os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(count), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
     torch.set_num_threads(1)
-    settings, samples, out = arguments
+    settings, samples, out, progress = arguments
     try:
-        train(settings, samples, out)
+        train(settings, samples, out, progress=progress)
     finally:
         if dist.is_initialized():
             dist.destroy_process_group()
 
 
-def train_in_processes(settings: TrainSettings, samples: LabelledFrames, out: str | Path, processes: int) -> Path:
+def train_in_processes(
+    settings: TrainSettings,
+    samples: LabelledFrames,
+    out: str | Path,
+    processes: int,
+    progress: Callable[[TrainProgress], None] | None = None,
+) -> Path:
     """`train` on the CPU in several one-thread processes with averaged gradients (2 such beat one with two threads).
 
-    samples must be picklable (it is sent to the processes). settings.batch_size counts per process.
+    samples and progress are sent to the processes and must be picklable; progress is called in the first of them.
+    settings.batch_size counts per process.
     """
     import socket
 
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    torch.multiprocessing.spawn(_train_worker, args=(processes, port, (settings, samples, out)), nprocs=processes)
+    torch.multiprocessing.spawn(
+        _train_worker, args=(processes, port, (settings, samples, out, progress)), nprocs=processes
+    )
     return Path(out) / "model.safetensors"

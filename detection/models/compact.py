@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 import torch
@@ -115,7 +116,7 @@ class PointStage(nn.Module):
         # No batch normalisation: in training the box head sees foreground points only.
         self.box_hidden = PointLayer(channels, channels, axes=1, norm=False)
         self.box_code = PointLayer(channels, self.coder.channels, axes=1, norm=False, activation=False)
-        nn.init.constant_(self.class_scores.conv.bias, -math.log(99.0))
+        nn.init.constant_(cast(Tensor, self.class_scores.conv.bias), -math.log(99.0))
         nn.init.normal_(self.box_code.conv.weight, std=0.001)
 
     def forward(self, points: Tensor) -> PointScores:
@@ -254,7 +255,7 @@ class CompactPointRCNN(nn.Module):
             self.points.code(features[likely]),
             self.points.coder,
             self.mean_sizes[classes[likely]],
-            soft=True,
+            soft=False,
         )
         boxes = torch.cat([boxes[:, :3], boxes[:, 3:6].clamp(min=0.2), boxes[:, 6:]], dim=1)
         kept = select_proposals(boxes, best[likely], settings)

@@ -122,7 +122,7 @@ class FeaturePropagation(nn.Module):
         rows = interpolate_rows(unknown, known, F.linear(features, weight[:, :channels]))
         if skip is not None:
             rows = rows + F.linear(skip, weight[:, channels:])
-        rows = F.relu(first.bn(rows) if first.bn is not None else rows + first.conv.bias, inplace=True)
+        rows = F.relu(cast(nn.Module, first.bn)(rows), inplace=True)
         for layer in list(self.mlp)[1:]:
             rows = layer(rows)
         return rows
