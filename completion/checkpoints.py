@@ -83,7 +83,7 @@ def save_checkpoint(path: str | Path, model: nn.Module, card: Card) -> Path:
 
 
 def find_weights(path_or_name: str | Path) -> Path:
-    """The .safetensors file of a path (with or without suffix) or of an embedded name. CheckpointError if there is none."""
+    """The .safetensors file of a path (suffix optional) or of an embedded name. CheckpointError if there is none."""
     given = Path(path_or_name)
     for candidate in (given.with_suffix(".safetensors"), WEIGHTS / f"{path_or_name}.safetensors"):
         if candidate.is_file():
@@ -121,7 +121,8 @@ def load_checkpoint(path_or_name: str | Path) -> tuple[nn.Module, Card]:
     found = hashlib.sha256(content).hexdigest()
     if found != card.sha256:
         raise CheckpointError(
-            f"{weights_path}: SHA-256 is {found[:12]}..., its card says {card.sha256[:12]}...; the file is damaged or not this card's"
+            f"{weights_path}: SHA-256 is {found[:12]}..., its card says {card.sha256[:12]}...; "
+            "the file is damaged or not this card's"
         )
     try:
         tensors = load_tensors(content)
@@ -134,6 +135,6 @@ def load_checkpoint(path_or_name: str | Path) -> tuple[nn.Module, Card]:
 
 
 def convert_checkpoint(path: str | Path, architecture: str, out: str | Path) -> Path:
-    """Import a published file (see `import_checkpoint`) and write it as our safetensors with a card; returns its path."""
+    """Import a published file (see `import_checkpoint`) and write it with a card; returns the safetensors path."""
     model, spec, facts = import_with_spec(path, architecture)
     return save_checkpoint(out, model, Card(spec, default_read_out(spec), facts))

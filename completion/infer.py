@@ -52,7 +52,7 @@ class NetworkCompleter:
         rows: int | None = None,
     ) -> None:
         self.device = torch.device(device)
-        self.model = model.to(self.device, memory_format=torch.channels_last).eval()
+        self.model = model.to(device=self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
         self.spec, self.read_out, self.rows = spec, read_out, rows
 
     def complete(
@@ -68,14 +68,19 @@ class NetworkCompleter:
         sizes = {frame.size for frame in frames}
         if len(sizes) != 1:
             raise ValueError(f"a batch must have one image size, got {sorted(sizes)}")
-        height, width = frames[0].size
+        height = frames[0].size[0]
         top = 0 if self.rows is None else max(0, height - self.rows)
         sparse = torch.from_numpy(np.stack([frame.sparse[top:] for frame in frames]))[:, None]
         rgb = torch.from_numpy(np.stack([frame.image[top:] for frame in frames])).permute(0, 3, 1, 2)
         with torch.inference_mode():
             completed = self._run(sparse.to(self.device), rgb.to(self.device))
-        maps = [F.pad(part, (0, 0, top, 0)).cpu().numpy() if part is not None else None for part in completed]
-        return [CompletedDepth(*(part[i] if part is not None else None for part in maps)) for i in range(len(frames))]
+        depth, foreground, background, sigma = (
+            None if part is None else F.pad(part, (0, 0, top, 0)).cpu().numpy() for part in completed
+        )
+        assert depth is not None
+        if foreground is None or background is None or sigma is None:
+            return [CompletedDepth(one) for one in depth]
+        return [CompletedDepth(*maps) for maps in zip(depth, foreground, background, sigma)]
 
     def _run(self, sparse: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor | None, Tensor | None, Tensor | None]:
         """(B, 1, h, w), (B, 3, h, w) uint8 -> depth, foreground, background, sigma, each (B, h, w) or None."""

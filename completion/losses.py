@@ -57,7 +57,7 @@ DEPTH_LOSSES = {"l1": l1, "l2": l2, "l1_l2": l1_l2, "huber": huber}
 
 @dataclass(frozen=True)
 class TwinLoss:
-    """Parts of the twin-surface loss, scalars; `total` is their sum (Eq. 4.8 with F in place of L_e, authors' erratum)."""
+    """Parts of the twin-surface loss, scalars; `total` is their sum (Eq. 4.8, F in place of L_e: authors' erratum)."""
 
     foreground: Tensor
     background: Tensor
@@ -141,7 +141,7 @@ def _first_valid(target: Tensor, factor: int) -> Tensor:
 
 
 def depth_edges(target: Tensor, window: int = 5, ratio: float = 1.1, step: float = 1.0) -> Tensor:
-    """1 where the valid depths within `window` pixels span more than `step` metres and the factor `ratio`; (B, 1, H, W)."""
+    """1 where valid depths within `window` pixels span more than `step` metres and the factor `ratio`; (B, 1, H, W)."""
     half = window // 2
     largest = F.max_pool2d(target, window, stride=1, padding=half)
     negative = torch.where(target > 0, -target, torch.full_like(target, -torch.inf))

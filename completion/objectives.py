@@ -57,7 +57,8 @@ def fits(objective: Objective, spec: ModelSpec) -> None:
     needed = {"twin": "twin", "dc": "coefficients"}.get(objective.kind, "depth")
     if spec.output != needed:
         raise ValueError(
-            f"objective {objective.kind!r} needs a network with output {needed!r}, {spec.architecture} gives {spec.output!r}"
+            f"objective {objective.kind!r} needs a network with output {needed!r}, "
+            f"{spec.architecture} gives {spec.output!r}"
         )
 
 

@@ -37,7 +37,10 @@ def save_state(
 def load_state(
     path: Path, model: nn.Module, optimiser: torch.optim.Optimizer, scaler: torch.amp.GradScaler
 ) -> dict[str, Any]:
-    """Restore model, optimiser, scaler and torch's generator in place; returns the facts. CheckpointError if it does not fit."""
+    """Restore model, optimiser, scaler and torch's generator in place; returns the facts.
+
+    CheckpointError when the file is not of this network.
+    """
     with safe_open(path, "pt") as file:
         header = json.loads((file.metadata() or {}).get("run", "{}"))
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)

@@ -135,7 +135,7 @@ def require_multiple(depth: Tensor, rgb: Tensor, multiple: int) -> None:
     height, width = int(depth.shape[-2]), int(depth.shape[-1])
     if depth.ndim != 4 or rgb.ndim != 4 or depth.shape[1] != 1 or rgb.shape[1] != 3 or rgb.shape[2:] != depth.shape[2:]:
         raise ValueError(
-            f"expected sparse depth (B, 1, H, W) and colour (B, 3, H, W), got {tuple(depth.shape)} and {tuple(rgb.shape)}"
+            f"expected sparse (B, 1, H, W) and colour (B, 3, H, W), got {tuple(depth.shape)} and {tuple(rgb.shape)}"
         )
     if not torch.jit.is_tracing() and (height % multiple or width % multiple):
         raise ValueError(

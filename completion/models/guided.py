@@ -10,6 +10,7 @@ is roughly linear interpolation in inverse depth with a foreground and a backgro
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -44,10 +45,8 @@ class CompactUNet(nn.Module):
         super().__init__()
         widths = (width, width * 3 // 2, width * 2, width * 3, width * 3)
         self.stem = nn.Sequential(_block(inputs * 4, width), Residual(width))
-        self.down = nn.ModuleList(
-            nn.Sequential(_block(a, b, stride=2), Residual(b)) for a, b in zip(widths[:-1], widths[1:])
-        )
-        self.lift = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(widths[:-1], widths[1:]))
+        self.down = nn.ModuleList(nn.Sequential(_block(a, b, stride=2), Residual(b)) for a, b in pairwise(widths))
+        self.lift = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairwise(widths))
         self.up = nn.ModuleList(_block(a, a) for a in widths[:-1])
         self.head = nn.Conv2d(width, outputs * 4, 1)
 
@@ -120,7 +119,7 @@ class Guided(nn.Module):
         return torch.cat((torch.minimum(near, far), torch.maximum(near, far), rest[:, 5:6]), 1)
 
     def _surface(self, logits: Tensor, inverse: Tensor, correction: Tensor) -> Tensor:
-        """Depth (B, 1, H, W) in metres: convex combination in inverse depth without small weights, times 1 +- residual."""
+        """(B, 1, H, W) metres: convex combination in inverse depth without small weights, times 1 +- residual."""
         weights = F.relu(torch.softmax(logits, 1) - self.cut)
         mixed = (weights * inverse).sum(1, keepdim=True) / weights.sum(1, keepdim=True)
         return (1 + self.residual * torch.tanh(correction)) / mixed

@@ -1,4 +1,4 @@
-"""The sparse-to-dense ResNet of Ma, Cavalheiro, Karaman, "Self-Supervised Sparse-to-Dense" (ICRA 2019), 18 or 34 layers.
+"""The sparse-to-dense ResNet (18 or 34) of Ma, Cavalheiro, Karaman, "Self-Supervised Sparse-to-Dense" (ICRA 2019).
 
 Layer names are those of the published state dictionary. Heads: one channel in metres, three for twin surfaces on the
 same backbone (thesis Table 4.5), or N logits (Table 3.3).
