@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline.config import Config, dump_config, load_config
+from pipeline.data import Dataset
 from pipeline.errors import UsageError
 from pipeline.paths import RunFolder
 from pipeline.runner.atomic import remove_leftovers, write_text
-from pipeline.runner.batch import Batch, StageSummary, open_batch
+from pipeline.runner.batch import Batch, StageSummary, open_batch, shard_of
 from pipeline.runner.failures import update_failures
 from pipeline.runner.jobs import Outcome, Task
 from pipeline.runner.processes import available_cores
 from pipeline.runner.signals import StopRequest, stop_on_signals
-from pipeline.stages import STAGES, data_root, frame_stages_for
+from pipeline.settings import nearest_name
+from pipeline.stages import FRAME_STAGES, STAGES, data_root, frame_stages_for, has_points, open_frames
 from pipeline.summary import print_dry_run, print_results, print_summary
 from pipeline.versions import made_with
 
@@ -49,7 +52,7 @@ def carry_out(request: Request) -> int:
     config = load_config(config_source(request, out), request.overrides)
     run = RunFolder(out)
     stage = request.stage or "report"
-    check_request(request, config, stage)
+    check_request(request, stage)
     if request.dry_run:
         return dry_run(config, run, stage, request.shard)
     prepare_folder(run, config)
@@ -79,21 +82,25 @@ def config_source(request: Request, out: Path) -> str | Path | None:
     return own if request.out is not None and own.is_file() else None
 
 
-def check_request(request: Request, config: Config, stage: str) -> None:
-    """What can be refused before any work: a wrong stage or combination, settings that do not fit."""
+def check_request(request: Request, stage: str) -> None:
+    """What can be refused before any work: a wrong stage or combination of options."""
     if stage not in STAGES:
-        raise UsageError(f"unknown stage {stage!r}; known: {', '.join(STAGES)}")
+        raise UsageError(f"unknown stage {stage!r}; {nearest_name(stage, STAGES)}")
     if request.engine != "local":
         raise UsageError(f"engine {request.engine!r} is not available in this version; use --engine local")
-    if request.shard is not None and stage not in ("complete", "augment", "detect"):
+    if request.shard is not None and stage not in FRAME_STAGES:
         raise UsageError(
             f"--shard is for complete, augment and detect; run --stage {stage} once for all shards, without it"
         )
-    from pipeline.stages import FRAME_STAGES
 
-    for name in frame_stages_for(stage, config):
+
+def stages_to_run(stage: str, config: Config, dataset: Dataset) -> list[str]:
+    """The frame stages of a request, after a look at their settings and weights: refused now rather than per frame."""
+    stages = frame_stages_for(stage, config, has_points(dataset))
+    for name in stages:
         FRAME_STAGES[name].settings(config)
         FRAME_STAGES[name].weights(config)
+    return stages
 
 
 def prepare_folder(run: RunFolder, config: Config) -> None:
@@ -124,26 +131,23 @@ def make_data(config: Config, run: RunFolder, stage: str, shard: tuple[int, int]
 
 
 def dry_run(config: Config, run: RunFolder, stage: str, shard: tuple[int, int] | None) -> int:
-    """Prints what would be done; writes nothing."""
-    from pipeline.runner.estimate import StageEstimate, estimate, estimate_batch
+    """Prints what would be done; writes nothing but the ledger of a run that exists."""
+    from pipeline.runner.estimate import estimate, estimate_batch
 
-    stages = frame_stages_for(stage, config)
     workers = config.run.workers or available_cores()
-    estimates: list[StageEstimate]
     if config.data.name == "synthetic" and not data_root(config, run).is_dir():
         from pipeline.synthetic import synth_settings
 
         frames = synth_settings(config).frames
-        estimates = [estimate(name, frames, workers, None) for name in stages]
+        estimates = [estimate(name, frames, workers, None) for name in frame_stages_for(stage, config)]
     elif run.root.is_dir():
         batch = open_batch(config, run, shard, StopRequest())
-        estimates = estimate_batch(batch, stages, workers)
+        estimates = estimate_batch(batch, stages_to_run(stage, config, batch.dataset), workers)
+        batch.close()
     else:
-        from pipeline.runner.batch import shard_of
-        from pipeline.stages import open_frames
-
-        frames = len(shard_of(open_frames(config, run).ids, shard))
-        estimates = [estimate(name, frames, workers, None) for name in stages]
+        dataset = open_frames(config, run)
+        frames = len(shard_of(dataset.ids, shard))
+        estimates = [estimate(name, frames, workers, None) for name in stages_to_run(stage, config, dataset)]
     print_dry_run(estimates, run, config)
     return DONE
 
@@ -152,13 +156,13 @@ def run_batch(request: Request, config: Config, run: RunFolder, stage: str, stop
     """The frame stages, then the scores and the report when they are asked for."""
     batch = open_batch(config, run, request.shard, stop)
     try:
-        summaries = [batch.run_stage(name) for name in frame_stages_for(stage, config) if not stop()]
+        stages = stages_to_run(stage, config, batch.dataset)
+        summaries = [batch.run_stage(name) for name in stages if not stop()]
         if not stop() and stage in ("evaluate", "report"):
             score(config, batch, explicit=request.stage == "evaluate")
         failures = update_failures(run, request.command)
     finally:
-        batch.engine.close()
-        batch.ledger.close()
+        batch.close()
     if not stop() and stage == "report":
         from pipeline.report.page import write_report
 
@@ -192,8 +196,6 @@ def conclude(
     if failed:
         print(f"some frames failed: {run.failures} says which and why", file=sys.stderr)
     if stop():
-        import shlex
-
         print(f"{stop.reason}; to continue: {shlex.join(request.command)}", file=sys.stderr)
         return 128 + stop.signal_number if stop.signal_number else SOME_FAILED
     return SOME_FAILED if failed else DONE

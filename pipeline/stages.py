@@ -230,8 +230,11 @@ FRAME_STAGES: dict[str, FrameStage] = {
 }
 
 
-def frame_stages_for(stage: str, config: Config) -> list[str]:
-    """The frame stages that `stage` (one of STAGES) needs, in order, itself included when it is one."""
+def frame_stages_for(stage: str, config: Config, has_points: bool = True) -> list[str]:
+    """The frame stages that `stage` (one of STAGES) needs, in order, itself included when it is one.
+
+    has_points  False for data sets without LiDAR (NYU, depth maps only): their depth is completed and nothing more
+    """
     last = {"synth": None, "train": "augment" if config.train.network == "detection" else None}.get(stage, "detect")
     if stage in FRAME_STAGES:
         last = stage
@@ -239,11 +242,22 @@ def frame_stages_for(stage: str, config: Config) -> list[str]:
         return []
     order = list(FRAME_STAGES)
     wanted = order[: order.index(last) + 1]
+    if not has_points:
+        if stage in ("augment", "detect"):
+            raise UsageError(
+                f"--stage {stage} needs LiDAR points, and {config.data.name} has none; use --stage complete"
+            )
+        return ["complete"]
     if uses_raw_lidar(config) and stage not in ("complete", "augment"):
         wanted = [name for name in wanted if name == "detect"]
     if config.augment.depth_from is not None and stage != "complete":
         wanted = [name for name in wanted if name != "complete"]
     return wanted
+
+
+def has_points(dataset: Dataset) -> bool:
+    """True when the frames of the data set come with LiDAR points."""
+    return len(dataset) == 0 or dataset[0].has("points")
 
 
 def data_root(config: Config, run: RunFolder) -> Path:

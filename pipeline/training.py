@@ -60,7 +60,7 @@ class CloudSamples:
 
 
 def train_stage(config: Config, run: RunFolder) -> Path:
-    """Trains (or continues to train) the network of the configuration; returns its weights. The same command continues."""
+    """Trains, or continues to train, the network of the configuration; returns its weights."""
     dataset = open_frames(config, run)
     out = run.weights / config.train.network
     print(f"training the {config.train.network} network on {len(dataset)} frames; state, log and weights: {out}")

@@ -112,6 +112,11 @@ class Batch:
             keys[frame_id] = key
             yield Task(stage, frame_id)
 
+    def close(self) -> None:
+        """Ends the workers and closes the ledger."""
+        self.engine.close()
+        self.ledger.close()
+
     def shared_key(self, stage: str) -> str:
         """The part of the key that all frames of a stage share."""
         kind = FRAME_STAGES[stage]
