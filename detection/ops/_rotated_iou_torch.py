@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from detection.ops.rotated_iou import RESIDUE
+
 
 def on_device(numpy_function: Callable[..., Any], torch_function: Callable[..., Any], a: Tensor, b: Tensor) -> Tensor:
     """Numba where the memory can be shared with numpy, torch elsewhere; no gradient, dtype and device of `a`."""
@@ -47,14 +49,13 @@ def _bev_intersection(a: Tensor, b: Tensor) -> Tensor:
     za, zb = z0.maximum(-half_w).minimum(half_w), z1.maximum(-half_w).minimum(half_w)
     slope = (x1 - x0) / torch.where(z1 == z0, 1.0, z1 - z0)
     mean = _clamped_mean(x0 + (za - z0) * slope, x1 + (zb - z1) * slope, half_l)
-    area = (mean * (zb - za)).sum(dim=-1).clamp(min=0.0)
-    solid = (a[..., 4] > 0) & (a[..., 5] > 0) & (b[..., 4] > 0) & (b[..., 5] > 0)
+    area = (mean * (zb - za)).sum(dim=-1)
+    residue = RESIDUE / 4 * (a[..., 4] * a[..., 5] + b[..., 4] * b[..., 5])
+    solid = (area > residue) & (a[..., 4] > 0) & (a[..., 5] > 0) & (b[..., 4] > 0) & (b[..., 5] > 0)
     return torch.where(solid, area, 0.0)
 
 
 def _ratio(shared: Tensor, total: Tensor) -> Tensor:
-    # Far boxes leave cancellation residues of 1e-16 instead of the exact 0 that the rejection by distance gives.
-    shared = torch.where(shared > 1e-15 * total.abs(), shared, 0.0)
     return (shared / torch.where(shared > 0, total - shared, 1.0)).clamp(max=1.0)
 
 
