@@ -20,7 +20,7 @@ from pipeline.pointcloud.columns import completed_columns, measured_columns
 from pipeline.pointcloud.grid_sampling import grid_sampling
 from pipeline.pointcloud.lidar_pixels import lidar_pixels, value_at
 from pipeline.pointcloud.presets import PRESETS, AugmentSettings, preset
-from pipeline.pointcloud.radius_gather import Radii, radius_gather
+from pipeline.pointcloud.radius_gather import radius_gather
 from pipeline.pointcloud.range_image import range_sample
 from pipeline.pointcloud.semantic_mask import object_score, semantic_mask
 from pipeline.pointcloud.sigma_filter import sigma_filter
@@ -113,7 +113,7 @@ class _StageFrame:
             raise ValueError(f"augment: semantics are {semantics.shape}, the completed depth is {completed.size}")
         return cls(completed, points, calibration, settings, object_score(semantics, settings.classes))
 
-    def count(self, step: str, before: int, after: int) -> None:
+    def count(self, step: str, before: int | np.integer, after: int | np.integer) -> None:
         """Note what a step did."""
         self.counts.append((step, int(before), int(after)))
 

@@ -1,6 +1,13 @@
-"""Back-projection of a depth map into the LiDAR frame (thesis section 5.3.1)."""
+"""Back-projection of a depth map into the LiDAR frame (thesis section 5.3.1).
+
+With P2 = [fu 0 cu p0; 0 fv cv p1; ...] the rectified camera point of pixel (u, v) is
+x = (u - cu) / fu * z - p0 / fu, y = (v - cv) / fv * z - p1 / fv, z = depth: the last terms are the baseline of the
+colour camera (KITTI devkit). It is then moved by T_velo_cam. All in float64, rounded to float32 once at the end.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -11,56 +18,95 @@ from pipeline.errors import DataError
 from pipeline.pointcloud.clouds import DenseCloud
 
 
+@dataclass(frozen=True)
+class PixelRays:
+    """What back-projection needs of a calibration.
+
+    slope_u   (W,) float64 (u - cu) / fu        slope_v  (H,) float64 (v - cv) / fv
+    baseline  (2,) float64 -p0 / fu, -p1 / fv, metres
+    T_velo_cam  (4, 4) float64, rectified camera 0 -> LiDAR
+    """
+
+    slope_u: NDArray[np.float64]
+    slope_v: NDArray[np.float64]
+    baseline: NDArray[np.float64]
+    T_velo_cam: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, calibration: Calibration, image_size: tuple[int, int]) -> PixelRays:
+        """The rays of an (H, W) image."""
+        height, width = image_size
+        P2 = calibration.P2
+        slope_u, slope_v = (np.arange(width) - P2[0, 2]) / P2[0, 0], (np.arange(height) - P2[1, 2]) / P2[1, 1]
+        baseline = np.array([-P2[0, 3] / P2[0, 0], -P2[1, 3] / P2[1, 1]])
+        return cls(slope_u, slope_v, baseline, np.ascontiguousarray(calibration.T_velo_cam))
+
+    def project_rows(self, depth: NDArray[np.float32], top: int, block: NDArray[np.float32]) -> int:
+        """Write the points of whole image rows from `top` on into (3, rows * W) `block`; how many it took."""
+        return int(_project_rows(depth, top, self.slope_u, self.slope_v, self.baseline, self.T_velo_cam, block))
+
+    def project_pixels(self, depth: NDArray[np.float32], pixels: NDArray[np.int32]) -> NDArray[np.float32]:
+        """(N,) pixels row * W + column -> (N, 3) float32 points, LiDAR frame."""
+        points = np.empty((len(pixels), 3), np.float32)
+        _project_pixels(depth, pixels, self.slope_u, self.slope_v, self.baseline, self.T_velo_cam, points)
+        return points
+
+
 def back_project(depth: NDArray[np.float32], calibration: Calibration, keep: NDArray[np.bool_]) -> DenseCloud:
     """(H, W) depth in metres -> the points of the pixels that `keep` marks and that have a value, in row order.
 
-    With P2 = [fu 0 cu p0; 0 fv cv p1; ...] the rectified camera point of pixel (u, v) is
-    x = (u - cu) / fu * z - p0 / fu, y = (v - cv) / fv * z - p1 / fv, z = depth: the last terms are the baseline of the
-    colour camera (KITTI devkit). It is then moved by T_velo_cam. All in float64, rounded to float32 once at the end.
-
     Raises DataError for a map of another shape than `keep` and for NaN, infinite or negative depth.
     """
+    depth, kept = usable_pixels(depth, keep)
+    pixels = np.flatnonzero(kept).astype(np.int32)
+    return DenseCloud(PixelRays.of(calibration, depth.shape).project_pixels(depth, pixels), pixels)
+
+
+def usable_pixels(
+    depth: NDArray[np.float32], keep: NDArray[np.bool_]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """The depth map, contiguous, and the pixels to take: marked by `keep` and with a value. Raises as `back_project`."""
     if depth.ndim != 2 or depth.shape != keep.shape:
         raise DataError("back-projection", f"an (H, W) depth map like the {keep.shape} mask", f"shape {depth.shape}")
     depth = np.ascontiguousarray(depth, dtype=np.float32)
-    height, width = depth.shape
-    P2 = calibration.P2
-    slope_u = (np.arange(width) - P2[0, 2]) / P2[0, 0]
-    slope_v = (np.arange(height) - P2[1, 2]) / P2[1, 1]
-    baseline = np.array([-P2[0, 3] / P2[0, 0], -P2[1, 3] / P2[1, 1]])
-    kept = np.ascontiguousarray(keep, dtype=np.bool_)
-    count = _count(depth, kept)
-    if count < 0:
+    kept = np.empty(depth.shape, np.bool_)
+    if _usable(depth.reshape(-1), np.ascontiguousarray(keep, np.bool_).reshape(-1), kept.reshape(-1)):
         raise DataError("back-projection", "finite depth >= 0 m, 0 = no value", "NaN, infinite or negative depth")
-    points, pixels = np.empty((count, 3), np.float32), np.empty(count, np.int32)
-    _back_project(depth, kept, slope_u, slope_v, baseline, calibration.T_velo_cam, points, pixels)
-    return DenseCloud(points, pixels)
+    return depth, kept
 
 
 @njit(cache=True, nogil=True)
-def _count(depth, keep):  # type: ignore[no-untyped-def]
-    """Marked pixels with a value, or -1 when any value of the map is not usable."""
-    count, wrong = 0, 0
-    for z, k in zip(depth.ravel(), keep.ravel()):
-        count += int(k & (z > 0))
-        wrong += int(not (z >= 0 and z < np.inf))
-    return -1 if wrong else count
+def _usable(depth, keep, kept):  # type: ignore[no-untyped-def]
+    """Fill `kept`; returns how many depth values are none."""
+    wrong = 0
+    for i in range(depth.size):
+        kept[i] = keep[i] & (depth[i] > 0)
+        wrong += 1 - np.int64((depth[i] >= 0) & (depth[i] < np.inf))
+    return wrong
 
 
 @njit(cache=True, nogil=True)
-def _back_project(depth, keep, slope_u, slope_v, baseline, T_velo_cam, points, pixels):  # type: ignore[no-untyped-def]
+def _project_rows(depth, top, slope_u, slope_v, baseline, T, block):  # type: ignore[no-untyped-def]
     height, width = depth.shape
-    T = T_velo_cam
-    at = 0
-    for row in range(height):
-        for column in range(width):
-            if not (keep[row, column] and depth[row, column] > 0):
-                continue
-            z = np.float64(depth[row, column])
-            x = slope_u[column] * z + baseline[0]
-            y = slope_v[row] * z + baseline[1]
-            points[at, 0] = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-            points[at, 1] = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
-            points[at, 2] = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-            pixels[at] = row * width + column
-            at += 1
+    rows = min(block.shape[1] // width, height - top)
+    for row in range(rows):
+        for axis in range(3):
+            for column in range(width):
+                z = np.float64(depth[top + row, column])
+                x = slope_u[column] * z + baseline[0]
+                y = slope_v[top + row] * z + baseline[1]
+                block[axis, row * width + column] = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] * z + T[axis, 3]
+    return rows
+
+
+@njit(cache=True, nogil=True)
+def _project_pixels(depth, pixels, slope_u, slope_v, baseline, T, points):  # type: ignore[no-untyped-def]
+    width = depth.shape[1]
+    for i in range(pixels.size):
+        row = pixels[i] // width
+        column = pixels[i] - row * width
+        z = np.float64(depth[row, column])
+        x = slope_u[column] * z + baseline[0]
+        y = slope_v[row] * z + baseline[1]
+        for axis in range(3):
+            points[i, axis] = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] * z + T[axis, 3]

@@ -1,103 +1,272 @@
 """Cubic cells of a point cloud in an open-addressing hash table; shared by grid sampling and radius gathering.
 
 A cell is floor(coordinate * (1 / size)) per axis, in float64. Its three numbers are packed into one int64 key
-(21 bits each, so about a million cells either way), and the table holds cell numbers given in order of first appearance.
+(21 bits each, so about a million cells either way). Cells are numbered in order of first appearance.
+
+Points come block by block (some image rows, or a stretch of a cloud). Neighbours in an image mostly share a cell, so a
+block is first cut into runs of one cell, without branches, and the table is asked once per run.
+
+All kernels that use the table are in this file: numba's cache notices a change of the file a kernel stands in, but not
+of another file whose functions were compiled into it.
 """
 
 from __future__ import annotations
 
-from math import floor
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 # 21 bits per axis; larger clouds or smaller cells are refused rather than wrapped around.
 CELL_LIMIT = 1 << 20
-NOT_FINITE = -1
-TOO_FAR = -2
-_FIRST_CAPACITY = 1 << 14
+_BLOCK = 16_384
+_LARGEST_FIRST_CAPACITY = 1 << 17
+# The radius in cells: just under half a cell, so that rounding can never push a neighbour into a third cell.
+_REACH = 0.5 * (1 - 1e-6)
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The occupied cells of N points and the runs of consecutive points in one cell.
+
+    run_start  (R + 1,) int32 first point of every run; the last entry is N
+    run_cell   (R,) int32 cell number of every run; -1 for points that are left out
+    keys       (M,) int64 packed key of every cell
+    table      (capacity,) int32 cell number at each slot or -1; a key is found by linear probing from its slot
+    """
+
+    run_start: NDArray[np.int32]
+    run_cell: NDArray[np.int32]
+    keys: NDArray[np.int64]
+    table: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+
+def occupied_cells(points: NDArray[np.float32], inverse_size: float, what: str) -> Cells:
+    """Cells of (N, 3 or more) float32 points for cells of 1 / `inverse_size` metres.
+
+    Raises ValueError, beginning with `what`, for other arrays, NaN, infinity, and coordinates beyond CELL_LIMIT cells.
+    """
+    if points.ndim != 2 or points.shape[1] < 3 or points.dtype != np.float32:
+        raise ValueError(f"{what}: expected (N, 3 or more) float32 points, got {points.shape} {points.dtype}")
+    run_start, run_key = np.empty(len(points) + 1, np.int32), np.empty(len(points), np.int64)
+    kept, runs = np.ones(len(points), np.bool_), 0
+    for first in range(0, len(points), _BLOCK):
+        block = np.ascontiguousarray(points[first : first + _BLOCK, :3].T)
+        runs = cut_into_runs(block, first, kept, inverse_size, runs, run_start, run_key)
+        if runs < 0:
+            refuse(bool(np.isfinite(points[:, :3]).all()), inverse_size, what)
+    return numbered(run_start[: runs + 1], run_key[:runs], len(points))
+
+
+def cut_into_runs(
+    block: NDArray[np.float32],
+    first: int,
+    kept: NDArray[np.bool_],
+    inverse_size: float,
+    runs: int,
+    run_start: NDArray[np.int32],
+    run_key: NDArray[np.int64],
+) -> int:
+    """Append the runs of a (3, n) block, whose points are numbered from `first`, behind the `runs` there are.
+
+    Points that `kept` (of all points) does not mark get key -1. Returns the new number of runs, or -1 when a kept
+    point has no cell (NaN, infinite, too far).
+    """
+    if runs == 0:
+        run_start[0] = 0
+    # One entry more than points: the last run ends where the key -2 follows, which no point has.
+    keys = np.full(block.shape[1] + 1, -2, np.int64)
+    return int(_cut_into_runs(block, first, kept, inverse_size, keys, runs, run_start, run_key))
+
+
+def refuse(finite: bool, inverse_size: float, what: str) -> None:
+    """Raise the ValueError for points that have no cell."""
+    if not finite:
+        raise ValueError(f"{what}: the points hold NaN or infinite values; drop them first")
+    raise ValueError(
+        f"{what}: a point lies more than {CELL_LIMIT / inverse_size:g} m from the origin, too far for cells of "
+        f"{1 / inverse_size:g} m; are the coordinates metres in the LiDAR frame?"
+    )
+
+
+def numbered(run_start: NDArray[np.int32], run_key: NDArray[np.int64], points: int) -> Cells:
+    """Number the cells of runs (key -1: left out) in order of first appearance."""
+    capacity = 1 << 10
+    while capacity < min(points // 2, _LARGEST_FIRST_CAPACITY):
+        capacity *= 2
+    # Sized for the cells, not for the points: it grows fourfold when half full and the count goes on where it stood.
+    run_cell = np.empty(len(run_key), np.int32)
+    table, keys = np.full(capacity, -1, np.int32), np.empty(capacity // 2, np.int64)
+    done, count = _number(run_key, run_cell, table, keys, 0, 0)
+    while done < len(run_key):
+        capacity *= 4
+        table, keys = np.full(capacity, -1, np.int32), np.concatenate([keys, np.empty(capacity // 2 - count, np.int64)])
+        _refill(table, keys, count)
+        done, count = _number(run_key, run_cell, table, keys, done, count)
+    return Cells(run_start, run_cell, keys[:count], table)
+
+
+def mark_near(
+    points: NDArray[np.float32],
+    group: NDArray[np.bool_],
+    anchors: NDArray[np.float32],
+    radius: float,
+    marked: NDArray[np.bool_],
+) -> None:
+    """Set `marked` for the points of `group` that have an anchor within `radius`, inclusive.
+
+    Cells are twice the radius wide, so a point's neighbourhood touches at most eight of them.
+    """
+    inverse_size = _REACH / radius
+    cells = occupied_cells(anchors, inverse_size, "radius gathering")
+    starts = np.zeros(len(cells) + 1, np.int32)
+    # One row per axis: a cell's anchors lie side by side, so that their distances are computed several at a time.
+    members = np.empty((3, len(anchors)), np.float32)
+    bounds = np.empty((len(cells), 6), np.float32)
+    bounds[:, :3], bounds[:, 3:] = np.inf, -np.inf
+    if not len(cells):
+        return
+    _sort_by_cell(anchors, cells.run_start, cells.run_cell, starts, members, bounds)
+    _mark_near(points, group, members, bounds, starts, cells.table, cells.keys, inverse_size, radius**2, marked)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def pack(ix, iy, iz):  # type: ignore[no-untyped-def]
+def _pack(ix, iy, iz):  # type: ignore[no-untyped-def]
     """One int64 key of three cell numbers inside +-CELL_LIMIT."""
     return ((np.int64(ix) + CELL_LIMIT) << 42) | ((np.int64(iy) + CELL_LIMIT) << 21) | (np.int64(iz) + CELL_LIMIT)
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _slot(key, capacity):  # type: ignore[no-untyped-def]
-    # Fibonacci hashing: the upper half of the product mixes all bits of the key.
-    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    return np.int64(mixed >> np.uint64(32)) & (capacity - 1)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def find(key, table, keys):  # type: ignore[no-untyped-def]
-    """Cell number of a key, or -1."""
-    capacity = table.size
-    slot = _slot(key, capacity)
-    while True:
-        cell = table[slot]
-        if cell < 0 or keys[cell] == key:
-            return cell
-        slot = (slot + 1) & (capacity - 1)
+    """Where the search for a key begins. Multiplying spreads a key upwards, folding brings all of it down again."""
+    product = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    return np.int64(product ^ (product >> np.uint64(32)) ^ (product >> np.uint64(47))) & (capacity - 1)
 
 
 @njit(cache=True, nogil=True)
-def _insert(key, cell, table):  # type: ignore[no-untyped-def]
-    capacity = table.size
-    slot = _slot(key, capacity)
-    while table[slot] >= 0:
-        slot = (slot + 1) & (capacity - 1)
-    table[slot] = cell
+def _cut_into_runs(block, first, kept, inverse_size, keys, runs, run_start, run_key):  # type: ignore[no-untyped-def]
+    count, wrong = block.shape[1], 0
+    for i in range(count):
+        x, y, z = block[0, i] * inverse_size, block[1, i] * inverse_size, block[2, i] * inverse_size
+        key = _pack(np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(z)))
+        keys[i] = key if kept[first + i] else np.int64(-1)
+        # Written so that NaN fails too.
+        has_cell = (abs(x) < CELL_LIMIT) & (abs(y) < CELL_LIMIT) & (abs(z) < CELL_LIMIT)
+        wrong += np.int64(kept[first + i]) & (1 - np.int64(has_cell))
+    if wrong:
+        return -1
+    for i in range(count):
+        # Written at every point; the place moves on only where the next key differs (no branches).
+        run_key[runs] = keys[i]
+        run_start[runs + 1] = first + i + 1
+        runs += np.int64(keys[i] != keys[i + 1])
+    return runs
 
 
 @njit(cache=True, nogil=True)
-def _rehashed(keys, count, capacity):  # type: ignore[no-untyped-def]
-    table = np.full(capacity, -1, np.int32)
+def _number(run_key, run_cell, table, keys, start, count):  # type: ignore[no-untyped-def]
+    """Number the cells from run `start` on; (runs done, cells so far). Stops when `keys` is full."""
+    capacity = table.size
+    for run in range(start, run_key.size):
+        key = run_key[run]
+        if key < 0:
+            run_cell[run] = -1
+            continue
+        at = _slot(key, capacity)
+        cell = table[at]
+        while (cell >= 0) & (keys[max(cell, 0)] != key):
+            at = (at + 1) & (capacity - 1)
+            cell = table[at]
+        if cell < 0:
+            if count == keys.size:
+                return run, count
+            cell = count
+            table[at] = cell
+            keys[count] = key
+            count += 1
+        run_cell[run] = cell
+    return run_key.size, count
+
+
+@njit(cache=True, nogil=True)
+def _refill(table, keys, count):  # type: ignore[no-untyped-def]
+    capacity = table.size
     for cell in range(count):
-        _insert(keys[cell], cell, table)
-    return table
+        at = _slot(keys[cell], capacity)
+        while table[at] >= 0:
+            at = (at + 1) & (capacity - 1)
+        table[at] = cell
 
 
 @njit(cache=True, nogil=True)
-def assign_cells(points, inverse_size, cell_of_point):  # type: ignore[no-untyped-def]
-    """Fill `cell_of_point`; return (number of cells or a negative code, table, keys).
+def _sort_by_cell(anchors, run_start, run_cell, starts, members, bounds):  # type: ignore[no-untyped-def]
+    """Counting sort: the anchors of cell c become members[:, starts[c] : starts[c + 1]] within bounds[c] (low, high)."""
+    for run in range(run_cell.size):
+        starts[run_cell[run] + 1] += run_start[run + 1] - run_start[run]
+    for cell in range(starts.size - 1):
+        starts[cell + 1] += starts[cell]
+    fill = starts[:-1].copy()
+    for run in range(run_cell.size):
+        cell = run_cell[run]
+        at = fill[cell]
+        for i in range(run_start[run], run_start[run + 1]):
+            for axis in range(3):
+                value = anchors[i, axis]
+                members[axis, at] = value
+                bounds[cell, axis] = min(bounds[cell, axis], value)
+                bounds[cell, 3 + axis] = max(bounds[cell, 3 + axis], value)
+            at += 1
+        fill[cell] = at
 
-    Neighbours in the image mostly share a cell, so the previous point's cell is tried before the table.
-    """
-    table = np.full(_FIRST_CAPACITY, -1, np.int32)
-    keys = np.empty(_FIRST_CAPACITY // 2, np.int64)
-    count, last_key, last_cell = 0, np.int64(-1), -1
+
+@njit(cache=True, nogil=True)
+def _mark_near(  # type: ignore[no-untyped-def]
+    points, group, members, bounds, starts, table, keys, inverse_size, limit, marked
+):
+    capacity = table.size
+    around = np.empty(8, np.int64)
+    last_x, last_y, last_z, found = np.int64(1 << 40), np.int64(0), np.int64(0), 0
     for i in range(points.shape[0]):
-        x, y, z = points[i, 0] * inverse_size, points[i, 1] * inverse_size, points[i, 2] * inverse_size
-        reach = max(abs(x), abs(y), abs(z))
-        if not reach < CELL_LIMIT or x != x or y != y or z != z:
-            finite = np.isfinite(points[i, 0]) and np.isfinite(points[i, 1]) and np.isfinite(points[i, 2])
-            return (TOO_FAR if finite else NOT_FINITE), table, keys
-        key = pack(floor(x), floor(y), floor(z))
-        if key != last_key:
-            last_key, last_cell = key, find(key, table, keys)
-            if last_cell < 0:
-                if count == keys.size:
-                    grown = np.empty(2 * count, np.int64)
-                    grown[:count] = keys
-                    keys = grown
-                    table = _rehashed(keys, count, 4 * count)
-                last_cell = count
-                keys[count] = key
-                _insert(key, count, table)
-                count += 1
-        cell_of_point[i] = last_cell
-    return count, table, keys
-
-
-def refuse(code: int, what: str, size: float) -> None:
-    """Raise the ValueError of a negative code of `assign_cells`; do nothing otherwise."""
-    if code == NOT_FINITE:
-        raise ValueError(f"{what}: the points hold NaN or infinite values; drop them first")
-    if code == TOO_FAR:
-        raise ValueError(
-            f"{what}: a point lies more than {CELL_LIMIT * size:g} m from the origin, "
-            f"too far for cells of {size:g} m; are the coordinates metres in the LiDAR frame?"
-        )
+        if not group[i]:
+            continue
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        # Half cells say both the cell and the side on which a second cell comes within reach.
+        fx, fy, fz = 2 * x * inverse_size, 2 * y * inverse_size, 2 * z * inverse_size
+        if not max(abs(fx), abs(fy), abs(fz)) < 2 * (CELL_LIMIT - 2):
+            continue  # anchors are all within the limit, so none is near
+        hx, hy, hz = np.int64(np.floor(fx)), np.int64(np.floor(fy)), np.int64(np.floor(fz))
+        if hx != last_x or hy != last_y or hz != last_z:  # neighbours in the image mostly share their eight cells
+            last_x, last_y, last_z, found = hx, hy, hz, 0
+            sx, sy, sz = 2 * (hx & 1) - 1, 2 * (hy & 1) - 1, 2 * (hz & 1) - 1
+            for corner in range(8):
+                key = _pack(
+                    (hx >> 1) + (corner & 1) * sx,
+                    (hy >> 1) + ((corner >> 1) & 1) * sy,
+                    (hz >> 1) + (corner >> 2) * sz,
+                )
+                at = _slot(key, capacity)
+                cell = np.int64(table[at])
+                while (cell >= 0) & (keys[max(cell, 0)] != key):
+                    at = (at + 1) & (capacity - 1)
+                    cell = np.int64(table[at])
+                around[found] = cell  # stays only when there is such a cell (no branch)
+                found += np.int64(cell >= 0)
+        for c in range(found):
+            cell = around[c]
+            # Returns lie on surfaces, so a cell's bounds are thin and mostly settle the matter.
+            bx = max(bounds[cell, 0] - x, x - bounds[cell, 3], 0.0)
+            by = max(bounds[cell, 1] - y, y - bounds[cell, 4], 0.0)
+            bz = max(bounds[cell, 2] - z, z - bounds[cell, 5], 0.0)
+            if bx * bx + by * by + bz * bz > limit:
+                continue
+            near = 0
+            for j in range(starts[cell], starts[cell + 1]):
+                dx, dy, dz = x - members[0, j], y - members[1, j], z - members[2, j]
+                near += np.int64(dx * dx + dy * dy + dz * dz <= limit)
+            if near:
+                marked[i] = True
+                break

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeline.pointcloud.cells import assign_cells, refuse
+from pipeline.pointcloud.cells import Cells, occupied_cells
 from pipeline.pointcloud.clouds import DenseCloud
 
 Representative = Literal["nearest", "first", "centroid"]
@@ -20,7 +20,7 @@ class GridSampling:
     """The grid.
 
     size            edge of a cell in metres (thesis: 0.2 in 5.3.4.2 and Fig. 5.7, 0.1 in Tables 5.5 and 5.7)
-    representative  "nearest": the point nearest to the centroid of its cell; "first": in row order; "centroid": the mean
+    representative  "nearest": the point nearest to the mean of its cell; "first": in row order; "centroid": the mean
     """
 
     size: float = 0.2
@@ -36,77 +36,134 @@ class GridSampling:
 def grid_sample(points: NDArray[np.float32], grid: GridSampling) -> NDArray[np.int64]:
     """(N, 3) points -> (M,) index of the representative of every occupied cell, in order of first appearance.
 
-    A point lies in cell floor(coordinate * (1 / size)), computed in float64. The centroid is the float64 mean in the
-    order of the points; of equally near points the first wins. For "centroid" the index is that of the nearest point,
+    A point lies in cell floor(coordinate * (1 / size)), computed in float64. The centroid is the float64 mean of the
+    points rounded to 15 nm (see `settle`); of equally near points the first wins. For "centroid" the index is that of the first point,
     whose pixel the mean takes (see `grid_sampling`).
 
     Raises ValueError for NaN or infinite coordinates.
     """
-    cell_of_point, cells = _cells(points, grid.size)
-    representatives = np.empty(cells, np.int64)
-    if grid.representative == "first":
-        _first(cell_of_point, representatives)
-    else:
-        sums = np.zeros((cells, 4))
-        _accumulate(points, cell_of_point, sums)
-        _nearest_to_centroid(points, cell_of_point, sums, np.full(cells, np.inf), representatives)
-    return representatives
-
-
-def grid_centroids(points: NDArray[np.float32], grid: GridSampling) -> NDArray[np.float32]:
-    """(N, 3) points -> (M, 3) float32 mean of every occupied cell, cells in the order of `grid_sample`."""
-    cell_of_point, cells = _cells(points, grid.size)
-    sums = np.zeros((cells, 4))
-    _accumulate(points, cell_of_point, sums)
-    return (sums[:, :3] / sums[:, 3:]).astype(np.float32)
+    cells = occupied_cells(points, 1.0 / grid.size, "grid sampling")
+    if grid.representative != "nearest":
+        return first_of_cells(cells)
+    columns, nearest = points[:, :3].T.copy(), np.zeros(len(cells), np.int32)
+    settle(columns)
+    centroids = _centroids(columns, cells)
+    centroids[:, 3] = np.inf
+    nearest_in_block(columns, 0, cells, 0, centroids, nearest)
+    return nearest.astype(np.int64)
 
 
 def grid_sampling(cloud: DenseCloud, grid: GridSampling) -> DenseCloud:
-    """The sampled cloud. With "centroid" the points are means and keep the pixel of the nearest member."""
-    sampled = cloud.select(grid_sample(cloud.points, grid))
-    if grid.representative == "centroid":
-        return DenseCloud(grid_centroids(cloud.points, grid), sampled.pixels)
-    return sampled
+    """The sampled cloud. With "centroid" the points are means and keep the pixel of their cell's first member."""
+    if grid.representative != "centroid":
+        return cloud.select(grid_sample(cloud.points, grid))
+    cells = occupied_cells(cloud.points, 1.0 / grid.size, "grid sampling")
+    columns = cloud.points.T.copy()
+    settle(columns)
+    centroids = _centroids(columns, cells)
+    return DenseCloud(centroids[:, :3].astype(np.float32), cloud.pixels[first_of_cells(cells)])
 
 
-def _cells(points: NDArray[np.float32], size: float) -> tuple[NDArray[np.int32], int]:
-    """Cell number of every point, numbered by first appearance, and how many cells there are."""
-    if points.ndim != 2 or points.shape[1] < 3 or points.dtype != np.float32:
-        raise ValueError(f"grid sampling: expected (N, 3) float32 points, got {points.shape} {points.dtype}")
-    cell_of_point = np.empty(len(points), np.int32)
-    cells, _, _ = assign_cells(points, 1.0 / size, cell_of_point)
-    refuse(cells, "grid sampling", size)
-    return cell_of_point, cells
+def _centroids(columns: NDArray[np.float32], cells: Cells) -> NDArray[np.float64]:
+    """(3, N) points -> (M, 4) centroid and number of members of every cell."""
+    sums = np.zeros((len(cells), 4))
+    add_block(columns, 0, cells, 0, sums)
+    sums[:, :3] /= sums[:, 3:]
+    return sums
+
+
+def first_of_cells(cells: Cells) -> NDArray[np.int64]:
+    """(M,) index of the first point of every cell."""
+    representatives = np.empty(len(cells), np.int64)
+    _first(cells.run_start, cells.run_cell, representatives)
+    return representatives
+
+
+def settle(points: NDArray[np.float32]) -> None:
+    """Round (3, n) points in place to multiples of 2^-26 m (15 nm).
+
+    Only coordinates below 0.125 m change, by less than 8 nm; float32 is coarser elsewhere. Then sums of half a million
+    coordinates below 128 m are exact in float64, so a centroid depends neither on the order of the points nor on how
+    they are added up, and the two points of a cell are equally near to it.
+    """
+    _settle(points)
+
+
+def add_block(points: NDArray[np.float32], first: int, cells: Cells, run: int, sums: NDArray[np.float64]) -> int:
+    """Add a settled (3, n) block to (M, 4) `sums` of x, y, z and count.
+
+    The block's points are numbered from `first` and begin with run `run`; returns the run behind them.
+    """
+    return int(_add_block(points, first, cells.run_start, cells.run_cell, run, sums))
+
+
+def nearest_in_block(
+    points: NDArray[np.float32],
+    first: int,
+    cells: Cells,
+    run: int,
+    centroids: NDArray[np.float64],
+    nearest: NDArray[np.int32],
+) -> int:
+    """Update (M,) `nearest`, the point nearest to each centroid; column 3 of `centroids` is its squared distance.
+
+    Block and runs as in `add_block`. Of equally near points the first wins.
+    """
+    return int(_nearest_in_block(points, first, cells.run_start, cells.run_cell, run, centroids, nearest))
 
 
 @njit(cache=True, nogil=True)
-def _first(cell_of_point, representatives):  # type: ignore[no-untyped-def]
+def _first(run_start, run_cell, representatives):  # type: ignore[no-untyped-def]
     seen = 0
-    for i in range(cell_of_point.size):
-        if cell_of_point[i] == seen:
-            representatives[seen] = i
+    for run in range(run_cell.size):
+        if run_cell[run] == seen:
+            representatives[seen] = run_start[run]
             seen += 1
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(points, cell_of_point, sums):  # type: ignore[no-untyped-def]
-    for i in range(cell_of_point.size):
-        cell = cell_of_point[i]
-        sums[cell, 0] += points[i, 0]
-        sums[cell, 1] += points[i, 1]
-        sums[cell, 2] += points[i, 2]
-        sums[cell, 3] += 1
+def _settle(points):  # type: ignore[no-untyped-def]
+    for axis in range(points.shape[0]):
+        for i in range(points.shape[1]):
+            points[axis, i] = np.rint(points[axis, i] * np.float64(1 << 26)) * (1.0 / (1 << 26))
 
 
 @njit(cache=True, nogil=True)
-def _nearest_to_centroid(points, cell_of_point, sums, nearest, representatives):  # type: ignore[no-untyped-def]
-    for cell in range(nearest.size):
-        for axis in range(3):
-            sums[cell, axis] = sums[cell, axis] / sums[cell, 3]
-    for i in range(cell_of_point.size):
-        cell = cell_of_point[i]
-        dx, dy, dz = points[i, 0] - sums[cell, 0], points[i, 1] - sums[cell, 1], points[i, 2] - sums[cell, 2]
-        distance = dx * dx + dy * dy + dz * dz
-        if distance < nearest[cell]:
-            nearest[cell] = distance
-            representatives[cell] = i
+def _add_block(points, first, run_start, run_cell, run, sums):  # type: ignore[no-untyped-def]
+    count = points.shape[1]
+    # Sums up to each point: a run's sum is the difference at its ends, without a loop of unforeseeable length.
+    upto = np.empty((count + 1, 3))
+    x, y, z = 0.0, 0.0, 0.0
+    for i in range(count):
+        upto[i, 0], upto[i, 1], upto[i, 2] = x, y, z
+        x += points[0, i]
+        y += points[1, i]
+        z += points[2, i]
+    upto[count, 0], upto[count, 1], upto[count, 2] = x, y, z
+    while run < run_cell.size and run_start[run] < first + count:
+        cell, start, end = run_cell[run], run_start[run] - first, run_start[run + 1] - first
+        if cell >= 0:
+            for axis in range(3):
+                sums[cell, axis] += upto[end, axis] - upto[start, axis]
+            sums[cell, 3] += end - start
+        run += 1
+    return run
+
+
+@njit(cache=True, nogil=True)
+def _nearest_in_block(points, first, run_start, run_cell, run, centroids, nearest):  # type: ignore[no-untyped-def]
+    end = first + points.shape[1]
+    while run < run_cell.size and run_start[run] < end:
+        cell = run_cell[run]
+        if cell >= 0:
+            x, y, z, smallest = centroids[cell, 0], centroids[cell, 1], centroids[cell, 2], centroids[cell, 3]
+            best = nearest[cell]
+            for i in range(run_start[run] - first, run_start[run + 1] - first):
+                dx, dy, dz = points[0, i] - x, points[1, i] - y, points[2, i] - z
+                distance = dx * dx + dy * dy + dz * dz
+                nearer = distance < smallest
+                smallest = distance if nearer else smallest
+                best = first + i if nearer else best
+            centroids[cell, 3], nearest[cell] = smallest, best
+        run += 1
+    return run

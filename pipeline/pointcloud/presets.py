@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from pipeline.pointcloud.grid_sampling import GridSampling
@@ -23,7 +23,7 @@ class AugmentSettings:
 
     lidar           raw LiDAR in the output
     completed       completed depth in the output
-    crop_lidar      use only raw returns that the camera sees (about 18k of 115k in KITTI); completed points exist nowhere else
+    crop_lidar      use only raw returns that the camera sees (about 18k of 115k in KITTI), as completed points are
     sigma           sigma filter
     range_image     azimuth-elevation resampling (Tables 5.5, 5.7)
     grid            grid sampling
@@ -39,13 +39,13 @@ class AugmentSettings:
     lidar: bool = True
     completed: bool = True
     crop_lidar: bool = True
-    sigma: SigmaBand | None = SigmaBand()
+    sigma: SigmaBand | None = field(default_factory=SigmaBand)
     range_image: RangeGrid | None = None
-    grid: GridSampling | None = GridSampling()
+    grid: GridSampling | None = field(default_factory=GridSampling)
     classes: tuple[int, ...] = OBJECTS
-    semantic: SemanticMask | None = SemanticMask()
+    semantic: SemanticMask | None = field(default_factory=SemanticMask)
     semantic_lidar: bool = False
-    near_lidar: Radii | None = Radii()
+    near_lidar: Radii | None = field(default_factory=Radii)
     columns: tuple[str, ...] = ()
     max_points: int = 0
 
