@@ -1,7 +1,8 @@
 """Rotating multi-beam LiDAR: where its beams go and what comes back.
 
-The HDL-64E has two blocks of 32 lasers (upper +2 to -8.33 degrees in steps of 1/3, lower -8.83 to -24.33 in steps of
-1/2) and turns at 10 Hz with a firing every 0.1728 degrees (Velodyne HDL-64E manual). KITTI's files list ring after ring
+The HDL-64E has two blocks of 32 lasers (nominally +2 to -8.33 degrees in steps of 1/3 and -8.83 to -24.33 in steps of
+1/2, Velodyne HDL-64E manual) and turns at 10 Hz with a firing every 0.17 degrees. Seen from the origin of KITTI's files
+the rings of the object frames lie at +2.2 to -7.8 and -8.4 to -23.7 degrees (medians per ring), which is used here. KITTI's files list ring after ring
 from the top, each counter-clockwise from the forward direction, up to 80 m.
 """
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.simulation.tracing import Tracer
 
-AZIMUTH_STEP = 0.1728
+AZIMUTH_STEP = 0.17
 MIN_RANGE, MAX_RANGE = 1.45, 80.0
 
 
@@ -36,7 +37,7 @@ class Sensor:
 
 
 def _hdl64e() -> NDArray[np.float64]:
-    nominal = np.concatenate([np.linspace(2.0, -8.33, 32), np.linspace(-8.83, -24.33, 32)])
+    nominal = np.concatenate([np.linspace(2.2, -7.78, 32), np.linspace(-8.38, -23.7, 32)])
     # Lasers sit up to a few hundredths of a degree off their nominal angle; the order never changes.
     return np.asarray(nominal + 0.05 * np.sin(2.39996 * np.arange(64)))
 
@@ -81,10 +82,13 @@ def scan(
     carry range noise.
     """
     directions, grid = beam_directions(sensor, rng)
-    reach, reflectance, cosine = _first_returns(tracer, directions @ T_world_velo[:3, :3].T, T_world_velo[:3, 3], rng)
-    power = _power(reach, reflectance, cosine)
-    reach = _mixed(reach.reshape(grid), rng).ravel()
-    returned = _detected(power, rng) & (rng.random(len(reach)) > sensor.loss)
+    reach, reflectance, cosine, polished = _first_returns(
+        tracer, directions @ T_world_velo[:3, :3].T, T_world_velo[:3, 3], rng
+    )
+    true_reach, reach = reach, _mixed(reach.reshape(grid), rng).ravel()
+    returned = _detected(_power(true_reach, reflectance, cosine, polished), rng) & (
+        rng.random(len(reach)) > sensor.loss
+    )
     ring = np.repeat(np.arange(grid[0]), grid[1])
     reach = reach + rng.normal(0, sensor.ring_bias, grid[0])[ring] + rng.normal(0, sensor.range_noise, len(reach))
     returned &= np.isfinite(reach) & (reach > MIN_RANGE) & (reach < MAX_RANGE)
@@ -96,14 +100,15 @@ def scan(
 
 def _first_returns(
     tracer: Tracer, rays: NDArray[np.float64], origin: NDArray[np.float64], rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """(range in metres or inf, reflectance, cosine of incidence) per ray; up to four panes are passed."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """(range in metres or inf, reflectance, cosine of incidence, polished) per ray; up to four panes are passed."""
     table = tracer.table
     total = np.zeros(len(rays))
     reflectance, cosine = np.zeros(len(rays)), np.zeros(len(rays))
     active = np.arange(len(rays))
     through = np.ones(len(rays))
     reach = np.full(len(rays), np.inf)
+    polished = np.zeros(len(rays), dtype=bool)
     for _ in range(5):
         start = origin + rays[active] * total[active, None]
         hits = tracer.cast(start, rays[active])
@@ -117,6 +122,7 @@ def _first_returns(
         reach[stopped] = total[stopped]
         reflectance[stopped] = table.reflectance[surface[~passed]] * through[stopped]
         cosine[stopped] = angle[~passed]
+        polished[stopped] = table.gloss[surface[~passed]] > 0.15
         lost = stopped[rng.random(len(stopped)) < table.dropout[surface[~passed]]]
         reach[lost] = np.inf
         active = active[passed]
@@ -124,24 +130,28 @@ def _first_returns(
         total[active] += 2e-3
         if not len(active):
             break
-    return reach, reflectance, cosine
+    return reach, reflectance, cosine, polished
 
 
 def _power(
-    reach: NDArray[np.float64], reflectance: NDArray[np.float64], cosine: NDArray[np.float64]
+    reach: NDArray[np.float64],
+    reflectance: NDArray[np.float64],
+    cosine: NDArray[np.float64],
+    polished: NDArray[np.bool_],
 ) -> NDArray[np.float64]:
     """Received power relative to a 10 % target facing the sensor at 50 m (the HDL-64E's stated range for it).
 
-    The root of the cosine stands for rough surfaces, which return more at grazing angles than Lambert's law says.
+    Polished paint falls faster than Lambert's cosine, as its mirror part is lost; rough ground returns far more at grazing angles
+    (KITTI's roads answer beyond 50 m, at cosines of 0.03).
     """
     distance = np.where(np.isfinite(reach), np.maximum(reach, 1.0), np.inf)
-    return np.asarray(reflectance * np.sqrt(cosine) / 0.1 * (50.0 / distance) ** 2)
+    return np.asarray(reflectance * np.where(polished, cosine**1.3, cosine**0.3) / 0.1 * (50.0 / distance) ** 2)
 
 
 def _detected(power: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.bool_]:
-    """A pulse is detected with a probability that falls from 1 to 0 around relative power 0.5."""
+    """A pulse is detected with a probability that falls from 1 to 0 around relative power 0.35."""
     with np.errstate(divide="ignore"):
-        chance = 1 / (1 + np.exp(-np.clip(3.0 * np.log(power / 0.5), -50, 50)))
+        chance = 1 / (1 + np.exp(-np.clip(3.0 * np.log(power / 0.35), -50, 50)))
     return np.asarray(rng.random(len(power)) < chance)
 
 
@@ -160,6 +170,9 @@ def intensity(
     reflectance: NDArray[np.float64], cosine: NDArray[np.float64], reach: NDArray[np.float64], rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """KITTI-like intensity in [0, 0.99], steps of 0.01: reflectance with a weak fall over angle and distance, speckled."""
-    fall = cosine**0.25 * np.clip(1.15 - reach / 90.0, 0.3, 1.0)
-    speckle = rng.normal(1.0, 0.18, len(reach))
-    return np.asarray(np.round(np.clip(1.05 * reflectance * fall * speckle - 0.02, 0, 0.99), 2))
+    fall = cosine**0.15 * np.clip(1.15 - reach / 110.0, 0.3, 1.0)
+    speckle = rng.normal(1.0, 0.14, len(reach))
+    echo = np.round(np.clip(1.12 * reflectance * fall * speckle - 0.01, 0, 0.99), 2)
+    # Dark things answer 0 in KITTI's files, and so do a few of all others.
+    echo[(rng.random(len(reach)) < 0.05) | (echo < 0.05)] = 0.0
+    return np.asarray(echo)

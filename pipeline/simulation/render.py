@@ -120,12 +120,13 @@ def expose(
     luminance = radiance @ np.array([0.21, 0.72, 0.07], dtype=np.float32)
     ground = luminance[~sky]
     level = float(np.exp(np.log(np.maximum(ground, 1e-3)).mean())) if ground.size else 0.2
-    gain = np.float32(0.13 * 2**light.exposure / max(level, 0.02))
+    gain = np.float32(0.075 * 2**light.exposure / max(level, 0.02))
     linear = radiance * gain * np.array([light.tint[0], 1.0, light.tint[1]], dtype=np.float32)
     linear = cv2.GaussianBlur(np.minimum(linear, 2.5), (0, 0), float(rng.uniform(0.42, 0.65)))
     shot = rng.standard_normal(linear.shape, dtype=np.float32)
-    strength = np.float32(rng.uniform(0.004, 0.016))
+    strength = np.float32(rng.uniform(0.010, 0.030))
     linear += shot * strength * np.sqrt(np.maximum(linear, 0.002))
     # A toe darker than the 1/2.2 curve: KITTI's cameras leave shadows black.
-    encoded = np.clip(linear, 0, 1) ** np.float32(1 / 2.1)
+    clipped = np.clip(linear - 0.007, 0, 1)
+    encoded = clipped ** np.float32(1 / 1.9)
     return np.asarray((encoded * 255 + 0.5), dtype=np.uint8)

@@ -99,9 +99,9 @@ def _pattern(
         flat = max(np.sqrt(n[0] * n[0] + n[1] * n[1]), 1e-6)
         u, v = (-n[1] * x + n[0] * y) / flat, z
     if kind == _ASPHALT:
-        grain = _fractal(x, y, z, 0.04, 2, footprint)
+        grain = _fractal(x, y, z, 0.05, 3, footprint)
         wide = _fractal(x, y, z, 2.5, 4, footprint)
-        return min(1.0, max(0.0, 0.9 * wide - 0.15)), 0.55 + 0.9 * grain
+        return min(1.0, max(0.0, 0.9 * wide - 0.15)), max(0.2, 1.0 + 2.2 * (grain - 0.5))
     if kind == _PAVING:
         joint, stone = _joints(u, v, scale, scale, 0.5, 0.008, footprint)
         return max(joint, 0.35 * stone), 0.75 + 0.5 * _fractal(x, y, z, 0.9, 4, footprint)
@@ -186,7 +186,7 @@ def shade(
         d, s = rays[i].astype(np.float64), surface[i]
         if s < 0:
             _sky(d, zenith, horizon, clouds, seen)
-            radiance[i] = seen * 1.25
+            radiance[i] = seen * 2.0
             continue
         n, p = normals[i].astype(np.float64), points[i].astype(np.float64)
         facing = max(-(n[0] * d[0] + n[1] * d[1] + n[2] * d[2]), 0.03)
@@ -195,6 +195,9 @@ def shade(
         towards = n[0] * sun[0] + n[1] * sun[1] + n[2] * sun[2]
         if texture[s] == _LEAVES:
             towards = 0.3 + 0.5 * abs(towards)
+        if texture[s] != _PAINT and texture[s] != _GLASS:
+            fine = _fractal(p[0], p[1], p[2], 0.11, 3, footprint)
+            factor = max(0.15, factor * (1 + (0.25 if texture[s] == _PLASTER else 0.6) * (fine - 0.5)))
         sunlight = direct * max(towards, 0.0) if lit[i] else 0.0
         skylight = ambient * (0.55 + 0.45 * n[2])
         for c in range(3):
@@ -206,6 +209,12 @@ def shade(
             cosine = -(n[0] * d[0] + n[1] * d[1] + n[2] * d[2])
             mirror[:] = d + 2 * cosine * n
             _sky(mirror, zenith, horizon, clouds, seen)
+            # Houses, trees and cars around stand up to a ragged skyline in the mirror image.
+            skyline = 0.05 + 0.7 * _noise(2.5 * mirror[0] + 0.2 * p[0], 2.5 * mirror[1] + 0.2 * p[1], 0.5)
+            if mirror[2] < skyline:
+                dark = 0.10 + 0.35 * _noise(6 * mirror[0] + p[0], 6 * mirror[1] + p[1], 8 * mirror[2])
+                for c in range(3):
+                    seen[c] = dark * horizon[c]
             fresnel = 0.07 + 0.93 * (1 - min(max(cosine, 0.0), 1.0)) ** 5
             glint = mirror[0] * sun[0] + mirror[1] * sun[1] + mirror[2] * sun[2]
             flash = 9.0 * max(glint, 0.0) ** 220 * direct if lit[i] else 0.0

@@ -160,8 +160,8 @@ class Ground:
 
 
 def draw_road(rng: np.random.Generator, straight: bool) -> Road:
-    """A road at random: bends of 150 m radius and more, slopes up to about 4 %."""
-    bend = 0.0008 if straight else 0.0035
+    """A road at random: bends of about 100 m radius and more, slopes up to about 4 %."""
+    bend = 0.0018 if straight else 0.006
     return Road(
         curvature=float(rng.normal(0, bend)),
         twist=float(rng.normal(0, bend / 90)),

@@ -10,6 +10,7 @@ from pipeline.simulation.scenes import furniture
 from pipeline.simulation.scenes import surfaces as S
 from pipeline.simulation.scenes.buildings import build_hall, build_house, noise_barrier
 from pipeline.simulation.scenes.ground import S_MAX, S_MIN, Band, Ground, draw_road
+from pipeline.simulation.scenes.mesh import Part, grid_faces
 from pipeline.simulation.scenes.placing import Site
 from pipeline.simulation.scenes.scene import Ego, Scene, draw_light
 from pipeline.simulation.scenes.surfaces import Surface, Texture, vary
@@ -22,7 +23,7 @@ def _asphalt(rng: np.random.Generator) -> Surface:
         Texture.ASPHALT,
         (tone, 0.99 * tone, 0.97 * tone),
         S.ROAD,
-        float(rng.uniform(0.18, 0.32)),
+        float(rng.uniform(0.22, 0.34)),
         second=(0.6 * tone,) * 3,
     )
 
@@ -74,6 +75,20 @@ def _houses(
         s += length + float(rng.uniform(0.1, gap))
 
 
+def _skyline(site: Site) -> None:
+    """A ragged line of woods beyond the end of the ground, out of the LiDAR's reach, that closes the horizon."""
+    rng = site.rng
+    angle = np.linspace(0, 2 * np.pi, 181)
+    height = np.interp(angle, np.linspace(0, 2 * np.pi, 40), rng.uniform(3, 14, 40)) + rng.uniform(-1, 1.5, 181)
+    height[-1] = height[0]
+    base = np.stack([30 + 135 * np.cos(angle), 118 * np.sin(angle), np.full(181, -12.0)], axis=-1)
+    top = base + np.column_stack([np.zeros((181, 2)), 12 + height])
+    woods = Surface(
+        Texture.GRASS, vary(rng, (0.05, 0.07, 0.035), 0.4), S.VEGETATION, 0.4, second=vary(rng, (0.09, 0.11, 0.06), 0.3)
+    )
+    site.static.append(Part(np.concatenate([base, top]), grid_faces(2, 181), woods))
+
+
 def _backdrop(site: Site, side: int, distance: float) -> None:
     """Woods or far houses that close the view."""
     rng = site.rng
@@ -118,11 +133,11 @@ def residential(rng: np.random.Generator) -> Scene:
         edge = half + walk
         on_kerb = rng.random() < 0.35
         site.parked_row(
-            side * (half - 1.0 + 0.8 * on_kerb), -45 + float(rng.uniform(0, 4)), 95, float(rng.beta(2, 1.6)), yaw
+            side * (half - 1.0 + 0.8 * on_kerb), -45 + float(rng.uniform(0, 4)), 95, float(rng.beta(1.6, 1.9)), yaw
         )
         site.boundary(side * (edge + 0.3), -50, 100)
         _houses(site, side, edge + float(rng.uniform(3, 8)), -60 + float(rng.uniform(0, 8)), 130, 5, 10, 9)
-        site.trees(side * (edge + 1.8), -45, 110, float(rng.uniform(8, 22)))
+        site.trees(side * (edge + 1.8), -45, 110, float(rng.uniform(6, 18)))
         site.bushes(side * edge + side * 0.8 - 0.4, side * edge + side * 3, int(rng.integers(2, 10)))
         site.furniture_row(side * (half + 0.45), int(rng.integers(4, 12)), np.pi if side > 0 else 0.0)
         site.walkers(*sorted((side * (half + 0.5), side * edge)), count=int(rng.integers(0, 4)))
@@ -131,6 +146,7 @@ def residential(rng: np.random.Generator) -> Scene:
     site.traffic(0.22 * half, np.pi, int(rng.integers(0, 2)), 12, 75, 6)
     site.traffic(-0.2 * half, 0.0, int(rng.integers(0, 2)), 10, 75, 6)
     site.cyclists(float(rng.choice([-1, 1])) * 0.3 * half, 0.0, int(rng.integers(0, 2)))
+    _skyline(site)
     site.static += ground.parts(rng)
     _patches(site, half)
     return Scene(
@@ -166,10 +182,11 @@ def arterial(rng: np.random.Generator) -> Scene:
         site.bushes(side * (half + walk + 3) - 2, side * (half + walk + 3) + 2, int(rng.integers(2, 9)))
         site.walkers(*sorted((side * (half + 2.2), side * (half + walk))), count=int(rng.integers(0, 4)))
         site.confusers(*sorted((side * (half + walk + 0.5), side * (half + walk + 5))), count=int(rng.integers(0, 4)))
-        if rng.random() < 0.7:
+        if rng.random() < 0.8:
             _houses(site, side, half + walk + float(rng.uniform(4, 16)), -60, 140, 6, 18, 16)
-        _backdrop(site, side, half + walk + 34)
+        _backdrop(site, side, half + walk + float(rng.uniform(14, 30)))
     site.cyclists(-half + 0.6, 0.0, int(rng.integers(0, 3)))
+    _skyline(site)
     site.static += ground.parts(rng)
     _patches(site, half)
     return Scene(
@@ -219,9 +236,10 @@ def highway(rng: np.random.Generator) -> Scene:
         site.trees(side * (half + verge + float(rng.uniform(3, 14))), -50, 130, float(rng.uniform(5, 25)), 2.5)
         site.bushes(side * (half + verge + 4) - 3, side * (half + verge + 4) + 3, int(rng.integers(3, 14)))
         site.confusers(side * (half + verge + 5) - 2, side * (half + verge + 5) + 2, int(rng.integers(0, 3)))
-        _backdrop(site, side, half + 40)
+        _backdrop(site, side, half + float(rng.uniform(14, 40)))
     for s in rng.uniform(0, 100, int(rng.integers(1, 4))):
         site.put(furniture.traffic_sign(rng), float(s), -half - 2.4)
+    _skyline(site)
     site.static += ground.parts(rng)
     return Scene(
         ground,
@@ -255,6 +273,7 @@ def courtyard(rng: np.random.Generator) -> Scene:
     site.traffic(-1.8, 0.0, int(rng.integers(0, 2)), 9, end - 6, 3)
     site.bushes(half + 0.5, half + 3, int(rng.integers(0, 6)), stop=end)
     site.bushes(-half - 3, -half - 0.5, int(rng.integers(0, 6)), stop=end)
+    _skyline(site)
     site.static += ground.parts(rng)
     _patches(site, half)
     return Scene(
@@ -304,6 +323,7 @@ def crossing(rng: np.random.Generator) -> Scene:
         site.confusers(*sorted((side * (half + walk + 1), side * (half + walk + 5))), count=int(rng.integers(0, 3)))
     site.cyclists(-half + 0.7, 0.0, int(rng.integers(0, 2)))
     site.put(build_grass(rng, 6, 2.0), 8.0, -half - walk - 2)
+    _skyline(site)
     site.static += ground.parts(rng)
     _patches(site, half)
     return Scene(

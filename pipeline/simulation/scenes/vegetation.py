@@ -67,9 +67,9 @@ def build_tree(rng: np.random.Generator, detail: float) -> list[Part]:
         level = stem + (height - stem) * rng.uniform(0.2, 0.75)
         centre = np.array([out * np.cos(angle) + lean[0], out * np.sin(angle) + lean[1], level])
         radii = np.array([1, 1, 0.75]) * spread * rng.uniform(0.45, 0.8)
-        count = int(620 * detail) + 25
-        parts.append(_blob(centre, radii, count, 0.20 / np.sqrt(max(detail, 0.08)), rng, leaves))
-        parts.append(ellipsoid(radii * 0.62, centre, _core(leaves), 6, 8))
+        count = int(1000 * detail) + 25
+        parts.append(_blob(centre, radii, count, 0.18 / np.sqrt(max(detail, 0.08)), rng, leaves))
+        parts.append(ellipsoid(radii * 0.5, centre, _core(leaves), 6, 8))
         if detail > 0.3:
             branch = np.stack([path[1], 0.5 * (path[1] + centre) + (0, 0, 0.1), centre])
             parts.append(tube(branch, girth * np.array([0.45, 0.3, 0.12]), 5, S.BARK))

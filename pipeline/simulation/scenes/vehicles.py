@@ -53,8 +53,8 @@ class BodyShape:
 
 BODIES: dict[str, BodyShape] = {
     "two_seater": BodyShape("Car", 2.60, 1.53, 1.54, 0.5, 0.52, 0.62, 0.14, 0.36, 0.86, 0.97, 0.60, 0.60, 0.78, 0.80, pillars=(0.62,)),
-    "city": BodyShape("Car", 3.45, 1.60, 1.49, 1.4, 0.50, 0.63, 0.22, 0.42, 0.88, 0.98, 0.62, 0.61, 0.76, 0.93, pillars=(0.60,)),
-    "hatchback_3": BodyShape("Car", 3.75, 1.63, 1.44, 1.6, 0.49, 0.63, 0.27, 0.46, 0.86, 0.975, 0.63, 0.61, 0.74, 0.92, pillars=(0.62,)),
+    "city": BodyShape("Car", 3.45, 1.60, 1.49, 1.7, 0.50, 0.63, 0.22, 0.42, 0.88, 0.98, 0.62, 0.61, 0.76, 0.93, pillars=(0.60,)),
+    "hatchback_3": BodyShape("Car", 3.75, 1.63, 1.44, 2.0, 0.49, 0.63, 0.27, 0.46, 0.86, 0.975, 0.63, 0.61, 0.74, 0.92, pillars=(0.62,)),
     "hatchback_5": BodyShape("Car", 4.02, 1.70, 1.48, 2.2, 0.50, 0.63, 0.26, 0.45, 0.87, 0.975, 0.64, 0.62, 0.75, 0.94),
     "compact_mpv": BodyShape("Car", 4.10, 1.70, 1.62, 1.0, 0.52, 0.64, 0.20, 0.40, 0.90, 0.985, 0.60, 0.59, 0.77, 0.95),
     "sedan": BodyShape("Car", 4.45, 1.73, 1.43, 1.3, 0.49, 0.63, 0.29, 0.46, 0.72, 0.86, 0.66, 0.62, 0.73, 0.83, pillars=(0.54,)),
@@ -65,18 +65,18 @@ BODIES: dict[str, BodyShape] = {
     "coupe": BodyShape("Car", 4.25, 1.74, 1.36, 0.6, 0.49, 0.63, 0.33, 0.50, 0.66, 0.90, 0.66, 0.63, 0.70, 0.80, pillars=(0.60,)),
     "roadster": BodyShape("Car", 3.95, 1.69, 1.28, 0.4, 0.52, 0.66, 0.36, 0.50, 0.64, 0.78, 0.68, 0.65, 0.72, 0.72, pillars=()),
     "pick_up": BodyShape("Car", 5.10, 1.80, 1.74, 0.3, 0.55, 0.63, 0.26, 0.38, 0.57, 0.61, 0.60, 0.60, 0.80, 0.60, clearance=0.17, pillars=(0.46,)),
-    "compact_van": BodyShape("Van", 4.35, 1.78, 1.86, 0.8, 0.47, 0.58, 0.20, 0.36, 0.96, 0.99, 0.55, 0.56, 0.84, 0.50, pillars=()),
-    "minibus": BodyShape("Van", 4.90, 1.88, 1.98, 0.9, 0.46, 0.56, 0.12, 0.27, 0.965, 0.99, 0.54, 0.54, 0.85, 0.96, pillars=(0.38, 0.66)),
-    "panel_van": BodyShape("Van", 5.50, 1.96, 2.45, 0.8, 0.40, 0.50, 0.12, 0.26, 0.975, 0.995, 0.48, 0.48, 0.88, 0.36, pillars=()),
+    "compact_van": BodyShape("Van", 4.35, 1.84, 1.86, 0.45, 0.47, 0.58, 0.20, 0.36, 0.96, 0.99, 0.55, 0.56, 0.84, 0.50, pillars=()),
+    "minibus": BodyShape("Van", 4.90, 1.93, 1.98, 0.4, 0.46, 0.56, 0.12, 0.27, 0.965, 0.99, 0.54, 0.54, 0.85, 0.96, pillars=(0.38, 0.66)),
+    "panel_van": BodyShape("Van", 5.50, 2.02, 2.40, 0.35, 0.40, 0.50, 0.12, 0.26, 0.975, 0.995, 0.48, 0.48, 0.88, 0.36, pillars=()),
 }  # fmt: skip
 
 # Linear albedo of paints and how often they are seen on KITTI's streets.
 _PAINTS: tuple[tuple[S.Colour, float, float], ...] = (
-    ((0.012, 0.012, 0.014), 0.22, 0.07),  # black
-    ((0.33, 0.34, 0.35), 0.22, 0.35),  # silver
-    ((0.11, 0.115, 0.12), 0.13, 0.18),  # grey
+    ((0.012, 0.012, 0.014), 0.22, 0.028),  # black
+    ((0.33, 0.34, 0.35), 0.22, 0.30),  # silver
+    ((0.11, 0.115, 0.12), 0.13, 0.10),  # grey
     ((0.66, 0.66, 0.65), 0.14, 0.62),  # white
-    ((0.022, 0.045, 0.14), 0.10, 0.15),  # dark blue
+    ((0.022, 0.045, 0.14), 0.10, 0.08),  # dark blue
     ((0.05, 0.13, 0.33), 0.04, 0.25),  # light blue
     ((0.32, 0.018, 0.016), 0.08, 0.42),  # red
     ((0.016, 0.06, 0.035), 0.03, 0.12),  # green
@@ -90,7 +90,7 @@ def paint(rng: np.random.Generator) -> Surface:
     chances = np.array([chance for _, chance, _ in _PAINTS])
     colour, _, reflectance = _PAINTS[rng.choice(len(_PAINTS), p=chances / chances.sum())]
     gloss = float(rng.uniform(0.25, 0.55))
-    return Surface(Texture.PAINT, S.vary(rng, colour, 0.2), S.CAR, reflectance, gloss=gloss, smooth=True)
+    return Surface(Texture.PAINT, S.vary(rng, colour, 0.2), S.CAR, reflectance, dropout=0.07, gloss=gloss, smooth=True)
 
 
 def _stations(shape: BodyShape) -> NDArray[np.float64]:
@@ -229,6 +229,10 @@ def _details(shape: BodyShape, length: float, width: float, height: float) -> li
     return parts
 
 
+# KITTI's annotators drew boxes round the returns: shorter and narrower than data sheets, higher because of ground noise.
+_ANNOTATED = (0.955, 0.96, 1.025)
+
+
 @dataclass(frozen=True)
 class Model:
     """A thing with a label: parts in the local frame and the exact (length, width, height) they fill, metres.
@@ -245,9 +249,9 @@ def build_vehicle(name: str, rng: np.random.Generator) -> Model:
     """A vehicle of BODIES[name] with its own size, colour and wheels."""
     shape = BODIES[name]
     scale = rng.normal(1.0, 0.035)
-    length = shape.length * float(np.clip(scale, 0.9, 1.1))
-    width = shape.width * float(np.clip(rng.normal(1.0, 0.025) + 0.3 * (scale - 1), 0.92, 1.08))
-    height = shape.height * float(np.clip(rng.normal(1.0, 0.03), 0.92, 1.08))
+    length = _ANNOTATED[0] * shape.length * float(np.clip(scale, 0.9, 1.1))
+    width = _ANNOTATED[1] * shape.width * float(np.clip(rng.normal(1.0, 0.025) + 0.3 * (scale - 1), 0.92, 1.08))
+    height = _ANNOTATED[2] * shape.height * float(np.clip(rng.normal(1.0, 0.03), 0.92, 1.08))
     jitter = {
         field: getattr(shape, field) + rng.normal(0, 0.008) for field in ("nose", "cowl", "x_cowl", "belt", "deck")
     }
