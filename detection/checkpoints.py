@@ -128,3 +128,10 @@ def load_exactly(model: nn.Module, tensors: Mapping[str, Tensor], where: str | P
         parts = [f"missing {missing[:5]}"] * bool(missing) + [f"unknown {unknown[:5]}"] * bool(unknown)
         raise ValueError(f"{where}: weights do not fit the network: " + "; ".join([*parts, *misshaped[:5]]))
     model.load_state_dict(dict(tensors))
+
+
+def import_checkpoint(path: str | Path, architecture: str) -> nn.Module:
+    """A network filled with a public checkpoint; see `detection.importers.import_checkpoint`."""
+    from detection.importers import import_checkpoint as read
+
+    return read(path, architecture)

@@ -145,12 +145,14 @@ class InputSettings:
     sampler   "near_far" (PointRCNN), "uniform" (thesis, dense clouds) or "balanced" (see `detection.sampling`)
     features  columns beside x y z, of `FEATURES`
     cloud     most points kept of the full cloud for the second stage; 0 when it does not use it
+    frame     "camera", or "lidar" for networks of OpenPCDet: input and output boxes are then in the LiDAR frame
     """
 
     points: int = 16384
     sampler: str = "near_far"
     features: tuple[str, ...] = ()
     cloud: int = 0
+    frame: str = "camera"
 
 
 def network_input(

@@ -14,10 +14,10 @@ Index = NDArray[np.int64]
 
 
 def near_far_sample(points: NDArray[Any], count: int, rng: np.random.Generator, far: float = 40.0) -> Index:
-    """(count,) indices by PointRCNN's rule: all points with z >= `far` metres, the rest from nearer ones.
+    """(count,) indices by PointRCNN's rule: all points with z >= `far` metres, nearer ones drawn at random.
 
     points  (N, 3+) rectified camera frame, N >= 1
-    With fewer points than `count`, all of them and duplicates (without replacement while N >= count / 2, with it below).
+    """Indices by PointRCNN's rule, shape (count,): all points with z >= `far` metres, nearer ones drawn at random.
     With more far points than `count`, a uniform draw over all points. Raises ValueError for an empty cloud.
     """
     if len(points) <= count:

@@ -77,6 +77,19 @@ class NamedBatchNorm(nn.Module):
         return cast(Tensor, self.bn(rows))
 
 
+def project(conv: PointwiseWeight, norm: nn.Module | None, rows: Tensor) -> Tensor:
+    """Convolution and normalisation, (..., in) -> (..., out); one product when the statistics are fixed."""
+    if norm is None or norm.training:
+        projected: Tensor = conv(rows)
+        return projected if norm is None else cast(Tensor, norm(projected))
+    scale, shift = _batch_norm(norm).as_affine()
+    return F.linear(rows, conv.matrix * scale[:, None], shift)
+
+
+def _batch_norm(norm: nn.Module) -> RowBatchNorm:
+    return cast(RowBatchNorm, norm.bn if isinstance(norm, NamedBatchNorm) else norm)
+
+
 class PointLayer(nn.Module):
     """1x1 convolution, batch normalisation (then without bias), ReLU.
 
@@ -91,41 +104,26 @@ class PointLayer(nn.Module):
         self.bn = NamedBatchNorm(out_channels) if norm else None
         self.activation = activation
 
-    def project(self, rows: Tensor, offset: Tensor | None = None) -> Tensor:
-        """Convolution and normalisation before the ReLU, (..., in) -> (..., out).
-
-        offset  (3,)-columns form of the input: (..., 3) relative coordinates whose product with the first three weight
-                columns is added to `rows`, which then already holds the product of the others (see `source_product`)
-        """
-        if offset is not None:
-            projected = rows + F.linear(offset, self.conv.matrix[:, :3], self.conv.bias)
-            return projected if self.bn is None else cast(Tensor, self.bn(projected))
-        if self.bn is not None and not self.training:
-            scale, shift = self.bn.bn.as_affine()
-            return F.linear(rows, self.conv.matrix * scale[:, None], shift)
-        projected = self.conv(rows)
-        return projected if self.bn is None else cast(Tensor, self.bn(projected))
-
-    def source_product(self, features: Tensor) -> Tensor:
-        """(..., in - 3) features -> (..., out): their share of the product, computed once per source point.
-
-        W [x_j - c, f_j] = W_x (x_j - c) + W_f f_j, and W_f f_j does not depend on the group that gathers point j.
-        """
-        return F.linear(features, self.conv.matrix[:, 3:])
-
     def forward(self, rows: Tensor) -> Tensor:
         """(..., in) -> (..., out)."""
-        projected = self.project(rows)
+        projected = project(self.conv, self.bn, rows)
         return F.relu(projected, inplace=True) if self.activation else projected
 
 
-class SharedMLP(nn.Sequential):
-    """PointLayers named layer0, layer1, ... applied to every point alike."""
+class PointMLP(nn.Sequential):
+    """Convolution, normalisation (or none) and ReLU, several times, on every point alike."""
 
-    def __init__(self, channels: Sequence[int], norm: bool = True) -> None:
-        super().__init__()
-        for k, (in_channels, out_channels) in enumerate(pairwise(channels)):
-            self.add_module(f"layer{k}", PointLayer(in_channels, out_channels, norm=norm))
+    def stages(self) -> list[tuple[PointwiseWeight, nn.Module | None]]:
+        """The convolutions with their normalisations, in order."""
+        convolutions = [module for module in self.modules() if isinstance(module, PointwiseWeight)]
+        norms: list[nn.Module | None] = [module for module in self.modules() if isinstance(module, RowBatchNorm)]
+        return list(zip(convolutions, norms or [None] * len(convolutions)))
+
+    def forward(self, rows: Tensor) -> Tensor:
+        """(..., in) -> (..., out)."""
+        for conv, norm in self.stages():
+            rows = F.relu(project(conv, norm, rows), inplace=True)
+        return rows
 
     def group_maximum(self, source: Tensor | None, offset: Tensor, gather: Tensor) -> Tensor:
         """The point network of one group level: (R, K) groups -> (R, out).
@@ -134,17 +132,41 @@ class SharedMLP(nn.Sequential):
         offset  (R, K, 3) coordinates of the neighbours relative to their centre, metres
         gather  (R, K) int64 row of each neighbour in `source`
         """
-        layers = cast("list[PointLayer]", list(self))
-        first = layers[0]
+        (conv, norm), *others = self.stages()
         if source is None:
-            rows = first.project(offset)
+            rows = project(conv, norm, offset)
         else:
-            shared = first.source_product(source)
-            rows = first.project(shared.index_select(0, gather.reshape(-1)).view(*gather.shape, -1), offset)
-        for layer in layers[1:]:
-            rows = layer.project(F.relu(rows, inplace=True))
+            # W [x_j - c, f_j] = W_x (x_j - c) + W_f f_j: the second product does not depend on the group that
+            # gathers point j, so it is taken once per source point.
+            shared = F.linear(source, conv.matrix[:, 3:])
+            rows = shared.index_select(0, gather.reshape(-1)).view(*gather.shape, -1)
+            rows = rows + F.linear(offset, conv.matrix[:, :3], conv.bias)
+            rows = rows if norm is None else norm(rows)
+        for conv, norm in others:
+            rows = project(conv, norm, F.relu(rows, inplace=True))
         # max(relu(x)) = relu(max(x)); the maximum first saves a pass over all neighbours.
         return F.relu(rows.max(dim=-2).values, inplace=True)
+
+
+class SharedMLP(PointMLP):
+    """Layers named layer0, layer1, ..., as in the checkpoints of PointRCNN and EPNet."""
+
+    def __init__(self, channels: Sequence[int], norm: bool = True) -> None:
+        super().__init__()
+        for k, (in_channels, out_channels) in enumerate(pairwise(channels)):
+            self.add_module(f"layer{k}", PointLayer(in_channels, out_channels, norm=norm))
+
+
+class IndexedMLP(PointMLP):
+    """Convolution, normalisation and ReLU at consecutive indices (0, 1, 2, 3, ...), as in OpenPCDet's checkpoints."""
+
+    def __init__(self, channels: Sequence[int], norm: bool = True) -> None:
+        modules: list[nn.Module] = []
+        for in_channels, out_channels in pairwise(channels):
+            modules.append(PointwiseWeight(in_channels, out_channels, 2, bias=not norm))
+            modules += [RowBatchNorm(out_channels)] * norm
+            modules.append(nn.ReLU())
+        super().__init__(*modules)
 
 
 def prediction_head(

@@ -10,8 +10,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from detection.models.layers import PointLayer, SharedMLP
+from detection.models.layers import IndexedMLP, PointMLP, SharedMLP, project
 from detection.ops import ball_query, furthest_point_sample, interpolation_weights, three_nn
+
+# How a checkpoint names the layers of a point network.
+AnyMLP = SharedMLP | IndexedMLP
 
 
 @dataclass(frozen=True)
@@ -54,10 +57,12 @@ def flat_index(index: Tensor, rows: int) -> Tensor:
 class SetAbstraction(nn.Module):
     """Sample centres by furthest points, group neighbours in balls, describe each group by a point network."""
 
-    def __init__(self, in_channels: int, spec: SetAbstractionSpec, norm: bool = True) -> None:
+    def __init__(
+        self, in_channels: int, spec: SetAbstractionSpec, norm: bool = True, mlp: type[AnyMLP] = SharedMLP
+    ) -> None:
         super().__init__()
         self.spec = spec
-        self.mlps = nn.ModuleList(SharedMLP((in_channels + 3, *widths), norm) for widths in spec.widths)
+        self.mlps = nn.ModuleList(mlp((in_channels + 3, *widths), norm) for widths in spec.widths)
 
     def forward(self, xyz: Tensor, features: Tensor | None) -> tuple[Tensor, Tensor]:
         """xyz (B, N, 3), features (B, N, C) or None -> centres (B, M, 3), features (B, M, C').
@@ -73,7 +78,7 @@ class SetAbstraction(nn.Module):
             offset = gather_rows(xyz, index) - centres.unsqueeze(2)
             rows = index.shape[0] * index.shape[1]
             gather = flat_index(index, xyz.shape[1]).view(rows, neighbours)
-            groups = cast(SharedMLP, mlp).group_maximum(source, offset.view(rows, neighbours, 3), gather)
+            groups = cast(PointMLP, mlp).group_maximum(source, offset.view(rows, neighbours, 3), gather)
             described.append(groups.view(*centres.shape[:2], -1))
         return centres, torch.cat(described, dim=-1)
 
@@ -81,9 +86,11 @@ class SetAbstraction(nn.Module):
 class GroupAll(nn.Module):
     """The last level of a second stage: one group of all points, coordinates not re-centred."""
 
-    def __init__(self, in_channels: int, widths: Sequence[int], norm: bool = True) -> None:
+    def __init__(
+        self, in_channels: int, widths: Sequence[int], norm: bool = True, mlp: type[AnyMLP] = SharedMLP
+    ) -> None:
         super().__init__()
-        self.mlps = nn.ModuleList([SharedMLP((in_channels + 3, *widths), norm)])
+        self.mlps = nn.ModuleList([mlp((in_channels + 3, *widths), norm)])
 
     def forward(self, xyz: Tensor, features: Tensor) -> Tensor:
         """xyz (B, N, 3), features (B, N, C) -> (B, C')."""
@@ -109,22 +116,22 @@ def interpolate_rows(unknown: Tensor, known: Tensor, features: Tensor) -> Tensor
 class FeaturePropagation(nn.Module):
     """Carry features from few points to many: three-point interpolation, skip connection, shared MLP."""
 
-    def __init__(self, in_channels: int, widths: Sequence[int]) -> None:
+    def __init__(self, in_channels: int, widths: Sequence[int], mlp: type[AnyMLP] = SharedMLP) -> None:
         super().__init__()
-        self.mlp = SharedMLP((in_channels, *widths))
+        self.mlp = mlp((in_channels, *widths))
 
     def forward(self, unknown: Tensor, known: Tensor, skip: Tensor | None, features: Tensor) -> Tensor:
         """unknown (B, N, 3), known (B, M, 3), skip (B, N, C1) or None, features (B, M, C2) -> (B, N, C')."""
-        first = cast(PointLayer, self.mlp[0])
+        (conv, norm), *others = self.mlp.stages()
         # The product with the interpolated columns is linear, so it is taken on the fewer known points.
-        weight = first.conv.matrix
+        weight = conv.matrix
         channels = features.shape[-1]
         rows = interpolate_rows(unknown, known, F.linear(features, weight[:, :channels]))
         if skip is not None:
             rows = rows + F.linear(skip, weight[:, channels:])
-        rows = F.relu(cast(nn.Module, first.bn)(rows), inplace=True)
-        for layer in list(self.mlp)[1:]:
-            rows = layer(rows)
+        rows = F.relu(cast(nn.Module, norm)(rows), inplace=True)
+        for conv, norm in others:
+            rows = F.relu(project(conv, norm, rows), inplace=True)
         return rows
 
 
@@ -136,14 +143,15 @@ class PointNet2Backbone(nn.Module):
         extra_channels: int,
         levels: Sequence[SetAbstractionSpec] = KITTI_LEVELS,
         propagation: Sequence[Sequence[int]] = KITTI_PROPAGATION,
+        mlp: type[AnyMLP] = SharedMLP,
     ) -> None:
         super().__init__()
         self.extra_channels = extra_channels
         skips = [extra_channels, *(level.out_channels for level in levels)]
-        self.SA_modules = nn.ModuleList(SetAbstraction(skips[k], level) for k, level in enumerate(levels))
+        self.SA_modules = nn.ModuleList(SetAbstraction(skips[k], level, mlp=mlp) for k, level in enumerate(levels))
         below = [*(widths[-1] for widths in propagation[1:]), skips[-1]]
         self.FP_modules = nn.ModuleList(
-            FeaturePropagation(below[k] + skips[k], widths) for k, widths in enumerate(propagation)
+            FeaturePropagation(below[k] + skips[k], widths, mlp) for k, widths in enumerate(propagation)
         )
         self.out_channels = propagation[0][-1]
 

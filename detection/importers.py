@@ -1,0 +1,199 @@
+"""Reading the public detector checkpoints without running anything in them.
+
+They are pickles. torch's restricted unpickler reads them; classes beside tensors and containers (configuration objects,
+optimiser scalars) are replaced by inert stand-ins that keep nothing. A file that calls a function is refused.
+"""
+
+from __future__ import annotations
+
+import pickle
+import re
+from collections import OrderedDict, defaultdict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from detection.models.openpcdet_pointrcnn import OpenPCDetPointRCNN
+from detection.models.presets import pointrcnn, pointrcnn2
+
+_NOT_ALLOWED = re.compile(r"GLOBAL ([\w.]+) was not an allowed global")
+_MOST_CLASSES = 30
+
+
+class _NeverCalled(type):
+    """Metaclass of the stand-ins: unpickling may make instances, a call from the file is refused."""
+
+    def __call__(cls, *args: Any, **kwargs: Any) -> Any:
+        raise pickle.UnpicklingError(f"the file calls {cls.__qualname__}")
+
+
+def _stand_in(full_name: str) -> type:
+    """An inert class read in place of `full_name`; its state is thrown away."""
+
+    def create(cls: type, *args: Any, **kwargs: Any) -> Any:
+        return object.__new__(cls)
+
+    def forget(self: Any, *state: Any) -> None:
+        return None
+
+    return _NeverCalled(full_name, (), {"__new__": create, "__setstate__": forget, "__slots__": ()})
+
+
+def _nothing(*args: Any) -> None:
+    """In place of NumPy's scalar constructor: optimiser states hold such numbers, weights never."""
+    return None
+
+
+_CONTAINERS: list[Any] = [
+    OrderedDict,
+    (defaultdict, "collections.defaultdict"),
+    (_nothing, "numpy.core.multiarray.scalar"),
+    (_nothing, "numpy._core.multiarray.scalar"),
+]
+
+
+def read_pickle(path: str | Path) -> Any:
+    """The content of a PyTorch file, legacy or zip. Raises ValueError when it calls a function or cannot be read."""
+    allowed = list(_CONTAINERS)
+    seen: set[str] = set()
+    while len(seen) < _MOST_CLASSES:
+        try:
+            with torch.serialization.safe_globals(allowed):
+                return torch.load(path, map_location="cpu", weights_only=True)
+        except pickle.UnpicklingError as error:
+            named = _NOT_ALLOWED.search(str(error))
+            if named is None or named.group(1) in seen:
+                reason = str(error).split(". ")[-1].split("\n")[0][:200]
+                raise ValueError(f"{path}: refused, nothing in it was executed: {reason}") from error
+            seen.add(named.group(1))
+            allowed.append((_stand_in(named.group(1)), named.group(1)))
+        except (RuntimeError, EOFError, KeyError, AttributeError, TypeError, IndexError) as error:
+            raise ValueError(f"{path}: expected a PyTorch checkpoint, cannot read it: {error}") from error
+    raise ValueError(f"{path}: refused: it mentions more than {_MOST_CLASSES} classes")
+
+
+def read_tensors(path: str | Path) -> dict[str, Tensor]:
+    """The tensors of `model_state`, `state_dict` or a bare state dict; a leading `module.` is taken off."""
+    content = read_pickle(path)
+    if isinstance(content, Mapping):
+        for key in ("model_state", "state_dict", "model"):
+            if isinstance(content.get(key), Mapping):
+                content = content[key]
+                break
+        tensors = {str(k).removeprefix("module."): v for k, v in content.items() if isinstance(v, Tensor)}
+        if tensors:
+            return tensors
+    raise ValueError(f"{path}: expected a dictionary with 'model_state' or a state dict of tensors, found no tensor")
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """What an import did with the file's tensors.
+
+    consumed  names that were loaded, each once       counters  num_batches_tracked the file lacks, left at zero
+    unused    names in the file that the network does not have
+    """
+
+    consumed: tuple[str, ...]
+    counters: tuple[str, ...]
+    unused: tuple[str, ...]
+
+
+def fill(model: nn.Module, tensors: Mapping[str, Tensor], where: str | Path) -> ImportReport:
+    """Load tensors by name; every parameter and running statistic must be there with its shape.
+
+    Shapes may differ by trailing axes of length 1 (Linear, Conv1d, Conv2d). Raises ValueError listing every name that
+    is missing, unknown or misshapen.
+    """
+    own = model.state_dict()
+    wrong: list[str] = []
+    loaded: dict[str, Tensor] = {}
+    counters = tuple(n for n in own if n not in tensors and n.endswith(("num_batches_tracked", "global_step")))
+    for name, value in own.items():
+        if name in counters:
+            loaded[name] = value
+        elif name not in tensors:
+            wrong.append(f"missing {name}")
+        elif _squeezed(tensors[name].shape) != _squeezed(value.shape):
+            wrong.append(f"{name} is {tuple(tensors[name].shape)}, expected {tuple(value.shape)}")
+        else:
+            loaded[name] = tensors[name].reshape(value.shape)
+    unused = tuple(name for name in tensors if name not in own)
+    wrong += [f"unknown {name}" for name in unused]
+    if wrong:
+        more = f"; and {len(wrong) - 8} more" if len(wrong) > 8 else ""
+        raise ValueError(f"{where}: does not fit this network ({len(own)} tensors): " + "; ".join(wrong[:8]) + more)
+    model.load_state_dict(loaded)
+    return ImportReport(tuple(name for name in own if name in tensors), counters, unused)
+
+
+def _squeezed(shape: torch.Size) -> tuple[int, ...]:
+    sizes = list(shape)
+    while len(sizes) > 1 and sizes[-1] == 1:
+        sizes.pop()
+    return tuple(sizes)
+
+
+def _extra_channels(tensors: Mapping[str, Tensor]) -> tuple[str, ...]:
+    """Point features for the input channels beyond x y z; the public code has one slot, for the intensity."""
+    first = tensors.get("rpn.backbone_net.SA_modules.0.mlps.0.layer0.conv.weight")
+    extra = 0 if first is None else int(first.shape[1]) - 3
+    if extra not in (0, 1):
+        raise ValueError(f"expected 3 or 4 input channels (x y z, intensity), the checkpoint has {extra + 3}")
+    return ("intensity",) * extra
+
+
+def _pointrcnn(tensors: Mapping[str, Tensor]) -> nn.Module:
+    heads = tensors.get("rpn.rpn_reg_layer.2.conv.weight")
+    return pointrcnn(
+        fine_location=heads is not None and heads.shape[0] == 76, features=_extra_channels(tensors)
+    ).build()
+
+
+def _epnet(tensors: Mapping[str, Tensor]) -> nn.Module:
+    fused = sorted({name.split(".")[2] for name in tensors if re.search(r"\.(Img_Block|Fusion_Conv|DeConv)\.", name)})
+    if fused:
+        raise ValueError(
+            f"this EPNet checkpoint was trained with image fusion (it holds {', '.join(fused)}); its point layers "
+            "expect fused features, so it cannot run on points alone; take the one trained without LI-Fusion"
+        )
+    branch = any(name.startswith("rcnn_net.iou_branch.") for name in tensors)
+    return pointrcnn2(features=_extra_channels(tensors), iou_branch=branch).build()
+
+
+def _openpcdet_pointrcnn(tensors: Mapping[str, Tensor]) -> nn.Module:
+    return OpenPCDetPointRCNN()
+
+
+# Architecture -> the network that fits a checkpoint's shapes.
+BUILDERS: dict[str, Callable[[Mapping[str, Tensor]], nn.Module]] = {
+    "pointrcnn": _pointrcnn,
+    "epnet": _epnet,
+    "openpcdet_pointrcnn": _openpcdet_pointrcnn,
+}
+
+
+def import_with_report(path: str | Path, architecture: str) -> tuple[nn.Module, ImportReport]:
+    """`import_checkpoint`, and what became of every tensor."""
+    if architecture not in BUILDERS:
+        raise ValueError(f"unknown architecture {architecture!r}; known are {', '.join(BUILDERS)}")
+    tensors = read_tensors(path)
+    try:
+        model = BUILDERS[architecture](tensors)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return model.eval(), fill(model, tensors, path)
+
+
+def import_checkpoint(path: str | Path, architecture: str) -> nn.Module:
+    """A network in eval mode filled with a public checkpoint.
+
+    architecture  "pointrcnn" (52 or 76 first-stage channels, told apart by shape), "epnet" (fusion off),
+                  "openpcdet_pointrcnn"
+    Raises ValueError when the file calls functions, is damaged, or does not fit; nothing in it is executed.
+    """
+    return import_with_report(path, architecture)[0]
