@@ -17,7 +17,7 @@ def near_far_sample(points: NDArray[Any], count: int, rng: np.random.Generator, 
     """(count,) indices by PointRCNN's rule: all points with z >= `far` metres, nearer ones drawn at random.
 
     points  (N, 3+) rectified camera frame, N >= 1
-    """Indices by PointRCNN's rule, shape (count,): all points with z >= `far` metres, nearer ones drawn at random.
+    With fewer points than `count`, all of them and duplicates (without replacement while N >= count / 2, else with).
     With more far points than `count`, a uniform draw over all points. Raises ValueError for an empty cloud.
     """
     if len(points) <= count:
