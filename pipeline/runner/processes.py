@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Protocol
@@ -38,14 +39,32 @@ def available_cores() -> int:
 
 def use_one_thread() -> None:
     """One computing thread in this process: by environment for libraries yet to be imported, by call for the others."""
+    numba = sys.modules.get("numba")
     for name in _THREAD_VARIABLES:
-        os.environ[name] = "1"
+        # Numba reads its variable again while it compiles, and refuses another value once its threads are running.
+        if numba is None or not name.startswith("NUMBA"):
+            os.environ[name] = "1"
+    if numba is not None:
+        numba.set_num_threads(1)
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(1)
-    if "numba" in sys.modules:
-        sys.modules["numba"].set_num_threads(1)
+
+
+@contextmanager
+def _one_thread_for_children() -> Iterator[None]:
+    """The environment of processes started in the block asks for one thread; this process' own is put back after."""
+    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 class LocalEngine:
@@ -112,12 +131,11 @@ class _WorkerProcess:
     """A process, the pipe to it, and the task it has in hand."""
 
     def __init__(self, make_worker: WorkerFactory) -> None:
-        for name in _THREAD_VARIABLES:
-            os.environ[name] = "1"
         context = multiprocessing.get_context("spawn")
         self.pipe, inner = context.Pipe()
         self.process: BaseProcess = context.Process(target=_serve, args=(inner, make_worker), daemon=True)
-        self.process.start()
+        with _one_thread_for_children():
+            self.process.start()
         inner.close()
         self.task: Task | None = None
         self.ended = False
