@@ -125,7 +125,7 @@ def measure(
 
 
 def _may_be_seen(matrix: NDArray[np.float64], reach: float, P: NDArray[np.float64], width: int) -> bool:
-    """A quick test on the centre: in front of the camera and within its horizontal field of view, with room to spare."""
+    """A quick test on the centre: in front of the camera and within its horizontal field of view, roughly."""
     x, _, z = matrix[:3, 3]
     return bool(z > -reach and abs(x) < (max(z, 0) + reach) * width / P[0, 0] * 0.75 + reach)
 

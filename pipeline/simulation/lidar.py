@@ -2,7 +2,8 @@
 
 The HDL-64E has two blocks of 32 lasers (nominally +2 to -8.33 degrees in steps of 1/3 and -8.83 to -24.33 in steps of
 1/2, Velodyne HDL-64E manual) and turns at 10 Hz with a firing every 0.17 degrees. Seen from the origin of KITTI's files
-the rings of the object frames lie at +2.2 to -7.8 and -8.4 to -23.7 degrees (medians per ring), which is used here. KITTI's files list ring after ring
+the rings of the object frames lie at +2.2 to -7.8 and -8.4 to -23.7 degrees (medians per ring), which is used
+here. KITTI's files list ring after ring
 from the top, each counter-clockwise from the forward direction, up to 80 m.
 """
 
@@ -56,7 +57,7 @@ def sensor(rows: int) -> Sensor:
 
 
 def beam_directions(sensor: Sensor, rng: np.random.Generator) -> tuple[NDArray[np.float64], tuple[int, int]]:
-    """((B*A, 3) unit directions in the LiDAR frame, (B, A)); rings start just left of forward, each at its own phase."""
+    """((B*A, 3) unit directions in the LiDAR frame, (B, A)); rings start left of forward, each at its own phase."""
     count = int(360.0 / sensor.azimuth_step)
     rings = len(sensor.elevations)
     phase = rng.uniform(0.02, 0.98, rings) * sensor.azimuth_step
@@ -141,7 +142,8 @@ def _power(
 ) -> NDArray[np.float64]:
     """Received power relative to a 10 % target facing the sensor at 50 m (the HDL-64E's stated range for it).
 
-    Polished paint falls faster than Lambert's cosine, as its mirror part is lost; rough ground returns far more at grazing angles
+    Polished paint falls faster than Lambert's cosine, as its mirror part is lost; rough ground returns far more at
+    grazing angles
     (KITTI's roads answer beyond 50 m, at cosines of 0.03).
     """
     distance = np.where(np.isfinite(reach), np.maximum(reach, 1.0), np.inf)
@@ -169,7 +171,7 @@ def _mixed(reach: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.f
 def intensity(
     reflectance: NDArray[np.float64], cosine: NDArray[np.float64], reach: NDArray[np.float64], rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """KITTI-like intensity in [0, 0.99], steps of 0.01: reflectance with a weak fall over angle and distance, speckled."""
+    """KITTI-like intensity in [0, 0.99], steps of 0.01: reflectance falling weakly with angle and distance."""
     fall = cosine**0.15 * np.clip(1.15 - reach / 110.0, 0.3, 1.0)
     speckle = rng.normal(1.0, 0.14, len(reach))
     echo = np.round(np.clip(1.12 * reflectance * fall * speckle - 0.01, 0, 0.99), 2)

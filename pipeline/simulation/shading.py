@@ -144,7 +144,7 @@ def _pattern(
         return 1.0 if band - np.floor(band) > 0.62 else 0.0, 1.0
     if kind == _BILLBOARD:
         return _step(_fractal(u, v, 0.0, scale, 3, footprint), 0.55, 0.03), 0.9 + 0.2 * _noise(u, v, 3.0)
-    if kind == _PAINT or kind == _GLASS:
+    if kind in (_PAINT, _GLASS):
         return 0.0, 1.0
     return 0.35 * _fractal(x, y, z, max(scale, 0.05), 3, footprint), 0.8 + 0.4 * _fractal(x, y, z, 0.25, 3, footprint)
 

@@ -10,6 +10,7 @@ import argparse
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -229,7 +230,7 @@ def plot(real: list[FrameStatistics], synthetic: list[FrameStatistics], path: Pa
         axes[1, 0].plot(100 * np.mean([f.ring_returns for f in frames], axis=0), color=colour, label=name)
         axes[1, 1].hist([f.in_view / 1000 for f in frames], bins=20, density=True, alpha=0.6, color=colour, label=name)
     axes[0, 0].set(yscale="log", xlabel="distance of the car, m", ylabel="LiDAR points in its box")
-    labels = [f"{low:.0f}-{high:.0f}" for low, high in zip(DEPTH_EDGES[:-1], DEPTH_EDGES[1:])]
+    labels = [f"{low:.0f}-{high:.0f}" for low, high in pairwise(DEPTH_EDGES)]
     axes[0, 1].set(xlabel="depth, m", ylabel="% of the sparse map")
     axes[0, 1].set_xticks(bins, labels)
     axes[1, 0].set(xlabel="ring, 0 = top", ylabel="% of pulses returned, +-38 degrees")

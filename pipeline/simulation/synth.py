@@ -121,7 +121,9 @@ def observe(
     right = None
     if settings.stereo and calibration.P3 is not None:
         right = render(tracer, scene.light, calibration.P3, T_world_cam, size, camera)
-    truths = measure(scene, time, calibration.P2, np.linalg.inv(T_world_cam), left.instances)
+    truths = measure(
+        scene, time, calibration.P2, np.asarray(np.linalg.inv(T_world_cam), dtype=np.float64), left.instances
+    )
     return SyntheticFrame(
         id=f"{index:06d}",
         left=left,

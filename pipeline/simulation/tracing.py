@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,9 +40,10 @@ class Tracer:
 
         self.triangles = triangles
         self.table = SurfaceTable.of(triangles.surfaces)
-        self._tensor = o3d.core.Tensor
+        tensor: Any = o3d.core.Tensor
+        self._tensor = tensor
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        self._scene.add_triangles(o3d.core.Tensor(triangles.vertices), o3d.core.Tensor(triangles.faces))
+        self._scene.add_triangles(tensor(triangles.vertices), tensor(triangles.faces))
 
     @cached_property
     def vertex_normals(self) -> NDArray[np.float32]:

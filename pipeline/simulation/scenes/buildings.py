@@ -9,7 +9,8 @@ from pipeline.simulation.scenes.mesh import Part, box, boxes, quad
 from pipeline.simulation.scenes.surfaces import Surface, Texture
 
 _FACADES: tuple[S.Colour, ...] = (
-    (0.62, 0.60, 0.55), (0.55, 0.46, 0.30), (0.48, 0.33, 0.24), (0.40, 0.40, 0.39), (0.60, 0.53, 0.42), (0.30, 0.34, 0.38), (0.5, 0.5, 0.52),
+    (0.62, 0.60, 0.55), (0.55, 0.46, 0.30), (0.48, 0.33, 0.24), (0.40, 0.40, 0.39), (0.60, 0.53, 0.42),
+    (0.30, 0.34, 0.38), (0.5, 0.5, 0.52),
 )  # fmt: skip
 
 
@@ -41,9 +42,10 @@ def _windows(rng: np.random.Generator, span: float, height: float, offset: float
         0.5,
         scale=0.5,
     )
+    sunk = np.array([0, 0, 0.08])
     at = np.column_stack([x, np.full(len(x), offset), z])
-    parts = [boxes(at, (wide + 0.16, 0.08, tall + 0.16), frame), boxes(at + (0, 0, 0.08), (wide, 0.1, tall), S.PANE)]
-    parts.append(boxes(at + (0, 0, 0.08), (0.05, 0.12, tall), frame))
+    parts = [boxes(at, (wide + 0.16, 0.08, tall + 0.16), frame), boxes(at + sunk, (wide, 0.1, tall), S.PANE)]
+    parts.append(boxes(at + sunk, (0.05, 0.12, tall), frame))
     if rng.random() < 0.3:
         shutter = Surface(
             Texture.BOARDS,
@@ -53,8 +55,8 @@ def _windows(rng: np.random.Generator, span: float, height: float, offset: float
             second=(0.02, 0.02, 0.02),
             scale=0.08,
         )
-        for side in (-1, 1):
-            parts.append(boxes(at + (side * (wide / 2 + 0.3), 0, 0), (0.42, 0.06, tall + 0.1), shutter))
+        beside = np.array([wide / 2 + 0.3, 0, 0])
+        parts += [boxes(at + side * beside, (0.42, 0.06, tall + 0.1), shutter) for side in (-1, 1)]
     door = Surface(
         Texture.BOARDS, S.vary(rng, (0.12, 0.06, 0.03), 0.5), S.BUILDING, 0.3, second=(0.04, 0.02, 0.01), scale=0.3
     )

@@ -31,8 +31,8 @@ def traffic_sign(rng: np.random.Generator) -> list[Part]:
     height = float(rng.uniform(2.1, 2.9))
     pole = cylinder(0.035, height + 0.3, S.METAL, 7)
     faces: tuple[tuple[S.Colour, S.Colour], ...] = (
-        ((0.6, 0.6, 0.6), (0.5, 0.02, 0.02)), ((0.02, 0.08, 0.4), (0.6, 0.6, 0.6)), ((0.6, 0.45, 0.03), (0.05, 0.05, 0.05)),
-        ((0.6, 0.6, 0.58), (0.06, 0.06, 0.06)),
+        ((0.6, 0.6, 0.6), (0.5, 0.02, 0.02)), ((0.02, 0.08, 0.4), (0.6, 0.6, 0.6)),
+        ((0.6, 0.45, 0.03), (0.05, 0.05, 0.05)),        ((0.6, 0.6, 0.58), (0.06, 0.06, 0.06)),
     )  # fmt: skip
     colour, second = faces[rng.integers(len(faces))]
     front = Surface(Texture.STRIPES, colour, S.TRAFFIC_SIGN, 0.95, second=second, scale=0.35)

@@ -102,7 +102,7 @@ class Ground:
         return np.array([x, y, float(self.road.height(s, d)) + self.lift(s, d)])
 
     def place(self, s: float, d: float, yaw: float = 0.0, tilted: bool = False) -> NDArray[np.float64]:
-        """(4, 4) T_world_object of a thing standing here, `yaw` from the road's direction; tilted: wheels on the slope."""
+        """(4, 4) T_world_object of a thing standing here, `yaw` from the road's direction; tilted: with the slope."""
         x, y, z = self.point(s, d)
         up = self.road.normal(s, d) if tilted else np.array([0.0, 0.0, 1.0])
         return pose(x, y, z, float(self.road.heading(s)) + yaw, up)

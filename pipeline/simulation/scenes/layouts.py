@@ -71,7 +71,8 @@ def _houses(
         if not site.on_crossing(s + length / 2, length / 2 + 1):
             maker = build_hall if rng.random() < 0.08 else build_house
             site.put(maker(rng, length, depth, height), s + length / 2, side * setback, 0.0 if side > 0 else np.pi)
-            site.taken.append((s, s + length, *sorted((side * (setback - 0.2), side * (setback + depth)))))
+            edges = (side * (setback - 0.2), side * (setback + depth))
+            site.taken.append((s, s + length, min(edges), max(edges)))
         s += length + float(rng.uniform(0.1, gap))
 
 
@@ -140,8 +141,8 @@ def residential(rng: np.random.Generator) -> Scene:
         site.trees(side * (edge + 1.8), -45, 110, float(rng.uniform(6, 18)))
         site.bushes(side * edge + side * 0.8 - 0.4, side * edge + side * 3, int(rng.integers(2, 10)))
         site.furniture_row(side * (half + 0.45), int(rng.integers(4, 12)), np.pi if side > 0 else 0.0)
-        site.walkers(*sorted((side * (half + 0.5), side * edge)), count=int(rng.integers(0, 4)))
-        site.confusers(*sorted((side * (edge + 1), side * (edge + 5))), count=int(rng.integers(0, 4)))
+        site.walkers(side * (half + 0.5), side * edge, count=int(rng.integers(0, 4)))
+        site.confusers(side * (edge + 1), side * (edge + 5), count=int(rng.integers(0, 4)))
     site.confusers(-half + 1, -half + 1.01, int(rng.integers(0, 2)))
     site.traffic(0.22 * half, np.pi, int(rng.integers(0, 2)), 12, 75, 6)
     site.traffic(-0.2 * half, 0.0, int(rng.integers(0, 2)), 10, 75, 6)
@@ -180,8 +181,8 @@ def arterial(rng: np.random.Generator) -> Scene:
         site.furniture_row(side * (half + 0.5), int(rng.integers(5, 14)), np.pi if side > 0 else 0.0)
         site.trees(side * (half + walk + float(rng.uniform(0.5, 4))), -50, 120, float(rng.uniform(6, 14)))
         site.bushes(side * (half + walk + 3) - 2, side * (half + walk + 3) + 2, int(rng.integers(2, 9)))
-        site.walkers(*sorted((side * (half + 2.2), side * (half + walk))), count=int(rng.integers(0, 4)))
-        site.confusers(*sorted((side * (half + walk + 0.5), side * (half + walk + 5))), count=int(rng.integers(0, 4)))
+        site.walkers(side * (half + 2.2), side * (half + walk), count=int(rng.integers(0, 4)))
+        site.confusers(side * (half + walk + 0.5), side * (half + walk + 5), count=int(rng.integers(0, 4)))
         if rng.random() < 0.8:
             _houses(site, side, half + walk + float(rng.uniform(4, 16)), -60, 140, 6, 18, 16)
         _backdrop(site, side, half + walk + float(rng.uniform(14, 30)))
@@ -261,10 +262,10 @@ def courtyard(rng: np.random.Generator) -> Scene:
     for side in (-1, 1):
         site.parked_bays(side * (half - 2.6), -30, end - 4, float(rng.uniform(0.35, 0.9)), side * np.pi / 2)
         _houses(site, side, half + float(rng.uniform(2.5, 7)), -45, end + 10, 6, 16, 6)
-        site.walkers(*sorted((side * (half - 6), side * (half - 5))), count=int(rng.integers(0, 3)))
+        site.walkers(side * (half - 6), side * (half - 5), count=int(rng.integers(0, 3)))
         site.furniture_row(side * (half + 0.7), int(rng.integers(3, 8)), np.pi if side > 0 else 0.0)
         site.trees(side * (half + 1.4), -30, end, float(rng.uniform(9, 20)), 0.2)
-        site.confusers(*sorted((side * (half + 1), side * (half + 4))), count=int(rng.integers(0, 4)))
+        site.confusers(side * (half + 1), side * (half + 4), count=int(rng.integers(0, 4)))
     if half > 11:
         site.parked_bays(0.0, 12, end - 8, float(rng.uniform(0.1, 0.5)), np.pi / 2)
     site.confusers(-half + 6, half - 6, int(rng.integers(0, 3)), 15, end)
@@ -315,12 +316,12 @@ def crossing(rng: np.random.Generator) -> Scene:
             float(rng.uniform(0.0, 0.75)),
             0.0 if side < 0 else np.pi,
         )
-        site.walkers(*sorted((side * (half + 0.6), side * (half + walk))), count=int(rng.integers(0, 5)))
+        site.walkers(side * (half + 0.6), side * (half + walk), count=int(rng.integers(0, 5)))
         site.furniture_row(side * (half + 0.6), int(rng.integers(4, 11)), np.pi if side > 0 else 0.0)
         _houses(site, side, half + walk + float(rng.uniform(0.5, 8)), -50, 130, 6, 16, 8)
         site.trees(side * (half + walk + 1), -40, 110, float(rng.uniform(9, 25)))
         site.bushes(side * (half + walk + 2) - 1, side * (half + walk + 2) + 1, int(rng.integers(1, 7)))
-        site.confusers(*sorted((side * (half + walk + 1), side * (half + walk + 5))), count=int(rng.integers(0, 3)))
+        site.confusers(side * (half + walk + 1), side * (half + walk + 5), count=int(rng.integers(0, 3)))
     site.cyclists(-half + 0.7, 0.0, int(rng.integers(0, 2)))
     site.put(build_grass(rng, 6, 2.0), 8.0, -half - walk - 2)
     _skyline(site)

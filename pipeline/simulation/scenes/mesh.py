@@ -15,6 +15,7 @@ from pipeline.simulation.scenes.surfaces import Surface
 
 Vertices = NDArray[np.float64]
 Faces = NDArray[np.int64]
+Floats = Sequence[float] | NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Part:
         return self.moved(pose(x, y, z, yaw))
 
 
-def pose(x: float, y: float, z: float, yaw: float, up: Sequence[float] = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:
+def pose(x: float, y: float, z: float, yaw: float, up: Floats = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:
     """(4, 4) transform of a body standing at x, y, z with heading `yaw` and its z axis along `up`."""
     z_axis = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
     heading = np.array([np.cos(yaw), np.sin(yaw), 0.0])
@@ -65,9 +66,8 @@ def fitted(parts: list[Part], length: float, width: float, height: float) -> lis
 
 
 _BOX_FACES = np.array(
-    [[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4], [2, 6, 3], [3, 6, 7], [0, 4, 2], [2, 4, 6]]
-    + [[1, 3, 5], [3, 7, 5]]
-)
+    [0, 2, 1, 1, 2, 3, 4, 5, 6, 5, 7, 6, 0, 1, 4, 1, 5, 4, 2, 6, 3, 3, 6, 7, 0, 4, 2, 2, 4, 6, 1, 3, 5, 3, 7, 5]
+).reshape(-1, 3)
 _UNIT_BOX = np.array([[x, y, z] for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)], dtype=np.float64)
 
 
@@ -76,7 +76,7 @@ def box(length: float, width: float, height: float, surface: Surface, z: float =
     return Part(_UNIT_BOX * (length, width, height) + (0, 0, z), _BOX_FACES, surface)
 
 
-def boxes(centres: NDArray[np.float64], size: Sequence[float], surface: Surface) -> Part:
+def boxes(centres: NDArray[np.float64], size: Floats, surface: Surface) -> Part:
     """Equal boxes at (N, 3) bottom centres."""
     count = len(centres)
     vertices = (_UNIT_BOX * np.asarray(size))[None] + np.asarray(centres)[:, None]
@@ -85,7 +85,7 @@ def boxes(centres: NDArray[np.float64], size: Sequence[float], surface: Surface)
 
 
 def grid_faces(rows: int, columns: int, closed: bool = False) -> Faces:
-    """(2 (rows-1) columns', 3) faces of a vertex grid in row-major order; `closed` joins the last column to the first."""
+    """(2 (rows-1) columns', 3) faces of a vertex grid in row-major order; `closed` joins last and first column."""
     last = columns if closed else columns - 1
     i, j = np.meshgrid(np.arange(rows - 1), np.arange(last), indexing="ij")
     right = (j + 1) % columns
@@ -117,9 +117,7 @@ def cylinder(radius: float, height: float, surface: Surface, sides: int = 10, to
     return tube(path, np.array([radius, radius if top is None else top]), sides, surface)
 
 
-def ellipsoid(
-    radii: Sequence[float], centre: Sequence[float], surface: Surface, rows: int = 7, sides: int = 10
-) -> Part:
+def ellipsoid(radii: Floats, centre: Floats, surface: Surface, rows: int = 7, sides: int = 10) -> Part:
     """An ellipsoid of latitude rings."""
     polar = np.linspace(0.02, np.pi - 0.02, rows)
     turn = np.arange(sides) * (2 * np.pi / sides)

@@ -164,7 +164,7 @@ class Site:
             s += length + (float(self.rng.uniform(0, 4)) if self.rng.random() < 0.6 else 0.0)
 
     def furniture_row(self, d: float, count: int, towards_road: float) -> None:
-        """Lamps, signs, bollards, bins and, now and then, signals along the kerb; `towards_road` is the yaw of +y to it."""
+        """Lamps, signs, bollards, bins and, now and then, signals along the kerb; `towards_road` turns +y to it."""
         makers = (
             furniture.street_lamp,
             furniture.traffic_sign,

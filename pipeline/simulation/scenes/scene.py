@@ -15,7 +15,7 @@ from pipeline.simulation.scenes.vehicles import Model
 
 @dataclass(frozen=True)
 class Placed:
-    """A labelled thing on the ground: road coordinates at time 0, heading relative to the road, speed along its heading."""
+    """A labelled thing: road coordinates at time 0, heading relative to the road, speed along its heading in m/s."""
 
     model: Model
     s: float

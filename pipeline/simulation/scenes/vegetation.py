@@ -13,7 +13,8 @@ from pipeline.simulation.scenes.mesh import Part, box, cards, cylinder, ellipsoi
 from pipeline.simulation.scenes.surfaces import Surface, Texture
 
 _GREENS: tuple[S.Colour, ...] = (
-    (0.055, 0.095, 0.022), (0.035, 0.07, 0.018), (0.09, 0.12, 0.03), (0.12, 0.115, 0.03), (0.03, 0.055, 0.025), (0.13, 0.075, 0.03),
+    (0.055, 0.095, 0.022), (0.035, 0.07, 0.018), (0.09, 0.12, 0.03), (0.12, 0.115, 0.03),
+    (0.03, 0.055, 0.025), (0.13, 0.075, 0.03),
 )  # fmt: skip
 
 

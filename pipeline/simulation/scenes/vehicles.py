@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulation.scenes import surfaces as S
-from pipeline.simulation.scenes.mesh import Part, box, fitted, grid_faces, quad, tube
+from pipeline.simulation.scenes.mesh import Part, box, fitted, grid_faces, tube
 from pipeline.simulation.scenes.surfaces import Surface, Texture
 
 
@@ -52,22 +52,38 @@ class BodyShape:
 
 
 BODIES: dict[str, BodyShape] = {
-    "two_seater": BodyShape("Car", 2.60, 1.53, 1.54, 0.5, 0.52, 0.62, 0.14, 0.36, 0.86, 0.97, 0.60, 0.60, 0.78, 0.80, pillars=(0.62,)),
-    "city": BodyShape("Car", 3.45, 1.60, 1.49, 1.7, 0.50, 0.63, 0.22, 0.42, 0.88, 0.98, 0.62, 0.61, 0.76, 0.93, pillars=(0.60,)),
-    "hatchback_3": BodyShape("Car", 3.75, 1.63, 1.44, 2.0, 0.49, 0.63, 0.27, 0.46, 0.86, 0.975, 0.63, 0.61, 0.74, 0.92, pillars=(0.62,)),
-    "hatchback_5": BodyShape("Car", 4.02, 1.70, 1.48, 2.2, 0.50, 0.63, 0.26, 0.45, 0.87, 0.975, 0.64, 0.62, 0.75, 0.94),
-    "compact_mpv": BodyShape("Car", 4.10, 1.70, 1.62, 1.0, 0.52, 0.64, 0.20, 0.40, 0.90, 0.985, 0.60, 0.59, 0.77, 0.95),
-    "sedan": BodyShape("Car", 4.45, 1.73, 1.43, 1.3, 0.49, 0.63, 0.29, 0.46, 0.72, 0.86, 0.66, 0.62, 0.73, 0.83, pillars=(0.54,)),
-    "limousine": BodyShape("Car", 4.95, 1.86, 1.47, 0.5, 0.50, 0.63, 0.30, 0.46, 0.72, 0.86, 0.65, 0.62, 0.73, 0.83, pillars=(0.54,)),
-    "estate": BodyShape("Car", 4.50, 1.72, 1.47, 1.2, 0.49, 0.62, 0.27, 0.43, 0.92, 0.985, 0.61, 0.61, 0.75, 0.96, pillars=(0.50, 0.71)),
-    "suv": BodyShape("Car", 4.40, 1.80, 1.70, 0.9, 0.55, 0.65, 0.25, 0.42, 0.90, 0.98, 0.63, 0.62, 0.78, 0.95, clearance=0.15),
-    "off_roader": BodyShape("Car", 4.20, 1.78, 1.82, 0.4, 0.56, 0.63, 0.30, 0.37, 0.965, 0.985, 0.61, 0.60, 0.88, 0.96, clearance=0.18),
-    "coupe": BodyShape("Car", 4.25, 1.74, 1.36, 0.6, 0.49, 0.63, 0.33, 0.50, 0.66, 0.90, 0.66, 0.63, 0.70, 0.80, pillars=(0.60,)),
-    "roadster": BodyShape("Car", 3.95, 1.69, 1.28, 0.4, 0.52, 0.66, 0.36, 0.50, 0.64, 0.78, 0.68, 0.65, 0.72, 0.72, pillars=()),
-    "pick_up": BodyShape("Car", 5.10, 1.80, 1.74, 0.3, 0.55, 0.63, 0.26, 0.38, 0.57, 0.61, 0.60, 0.60, 0.80, 0.60, clearance=0.17, pillars=(0.46,)),
-    "compact_van": BodyShape("Van", 4.35, 1.84, 1.86, 0.45, 0.47, 0.58, 0.20, 0.36, 0.96, 0.99, 0.55, 0.56, 0.84, 0.50, pillars=()),
-    "minibus": BodyShape("Van", 4.90, 1.93, 1.98, 0.4, 0.46, 0.56, 0.12, 0.27, 0.965, 0.99, 0.54, 0.54, 0.85, 0.96, pillars=(0.38, 0.66)),
-    "panel_van": BodyShape("Van", 5.50, 2.02, 2.40, 0.35, 0.40, 0.50, 0.12, 0.26, 0.975, 0.995, 0.48, 0.48, 0.88, 0.36, pillars=()),
+    "two_seater": BodyShape("Car", 2.60, 1.53, 1.54, 0.5,
+        0.52, 0.62, 0.14, 0.36, 0.86, 0.97, 0.60, 0.60, 0.78, 0.80, pillars=(0.62,)),
+    "city": BodyShape("Car", 3.45, 1.60, 1.49, 1.7,
+        0.50, 0.63, 0.22, 0.42, 0.88, 0.98, 0.62, 0.61, 0.76, 0.93, pillars=(0.60,)),
+    "hatchback_3": BodyShape("Car", 3.75, 1.63, 1.44, 2.0,
+        0.49, 0.63, 0.27, 0.46, 0.86, 0.975, 0.63, 0.61, 0.74, 0.92, pillars=(0.62,)),
+    "hatchback_5": BodyShape("Car", 4.02, 1.70, 1.48, 2.2,
+        0.50, 0.63, 0.26, 0.45, 0.87, 0.975, 0.64, 0.62, 0.75, 0.94),
+    "compact_mpv": BodyShape("Car", 4.10, 1.70, 1.62, 1.0,
+        0.52, 0.64, 0.20, 0.40, 0.90, 0.985, 0.60, 0.59, 0.77, 0.95),
+    "sedan": BodyShape("Car", 4.45, 1.73, 1.43, 1.3,
+        0.49, 0.63, 0.29, 0.46, 0.72, 0.86, 0.66, 0.62, 0.73, 0.83, pillars=(0.54,)),
+    "limousine": BodyShape("Car", 4.95, 1.86, 1.47, 0.5,
+        0.50, 0.63, 0.30, 0.46, 0.72, 0.86, 0.65, 0.62, 0.73, 0.83, pillars=(0.54,)),
+    "estate": BodyShape("Car", 4.50, 1.72, 1.47, 1.2,
+        0.49, 0.62, 0.27, 0.43, 0.92, 0.985, 0.61, 0.61, 0.75, 0.96, pillars=(0.50, 0.71)),
+    "suv": BodyShape("Car", 4.40, 1.80, 1.70, 0.9,
+        0.55, 0.65, 0.25, 0.42, 0.90, 0.98, 0.63, 0.62, 0.78, 0.95, clearance=0.15),
+    "off_roader": BodyShape("Car", 4.20, 1.78, 1.82, 0.4,
+        0.56, 0.63, 0.30, 0.37, 0.965, 0.985, 0.61, 0.60, 0.88, 0.96, clearance=0.18),
+    "coupe": BodyShape("Car", 4.25, 1.74, 1.36, 0.6,
+        0.49, 0.63, 0.33, 0.50, 0.66, 0.90, 0.66, 0.63, 0.70, 0.80, pillars=(0.60,)),
+    "roadster": BodyShape("Car", 3.95, 1.69, 1.28, 0.4,
+        0.52, 0.66, 0.36, 0.50, 0.64, 0.78, 0.68, 0.65, 0.72, 0.72, pillars=()),
+    "pick_up": BodyShape("Car", 5.10, 1.80, 1.74, 0.3,
+        0.55, 0.63, 0.26, 0.38, 0.57, 0.61, 0.60, 0.60, 0.80, 0.60, clearance=0.17, pillars=(0.46,)),
+    "compact_van": BodyShape("Van", 4.35, 1.84, 1.86, 0.45,
+        0.47, 0.58, 0.20, 0.36, 0.96, 0.99, 0.55, 0.56, 0.84, 0.50, pillars=()),
+    "minibus": BodyShape("Van", 4.90, 1.93, 1.98, 0.4,
+        0.46, 0.56, 0.12, 0.27, 0.965, 0.99, 0.54, 0.54, 0.85, 0.96, pillars=(0.38, 0.66)),
+    "panel_van": BodyShape("Van", 5.50, 2.02, 2.40, 0.35,
+        0.40, 0.50, 0.12, 0.26, 0.975, 0.995, 0.48, 0.48, 0.88, 0.36, pillars=()),
 }  # fmt: skip
 
 # Linear albedo of paints and how often they are seen on KITTI's streets.
@@ -229,7 +245,7 @@ def _details(shape: BodyShape, length: float, width: float, height: float) -> li
     return parts
 
 
-# KITTI's annotators drew boxes round the returns: shorter and narrower than data sheets, higher because of ground noise.
+# KITTI's annotators drew boxes round the returns: shorter and narrower than data sheets, a little higher.
 _ANNOTATED = (0.955, 0.96, 1.025)
 
 
