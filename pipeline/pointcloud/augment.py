@@ -17,6 +17,7 @@ from pipeline.errors import UsageError
 from pipeline.pointcloud.backproject import back_project
 from pipeline.pointcloud.clouds import DenseCloud
 from pipeline.pointcloud.columns import completed_columns, measured_columns
+from pipeline.pointcloud.depth_sampling import back_project_and_sample
 from pipeline.pointcloud.grid_sampling import grid_sampling
 from pipeline.pointcloud.lidar_pixels import lidar_pixels, value_at
 from pipeline.pointcloud.presets import PRESETS, AugmentSettings, preset
@@ -68,9 +69,8 @@ def augment_frame(
     frame = _StageFrame.checked(completed, points, calibration, settings, semantics)
     lidar = _seen_by_camera(frame)
     keep = _without_smeared_pixels(frame)
-    dense = back_project(completed.depth, calibration, keep)
+    dense = _points_of(frame, keep)
     dense = _resampled_like_lidar(frame, dense)
-    dense = _grid_sampled(frame, dense)
     dense = _objects_and_context(frame, dense)
     dense = _near_raw_lidar(frame, dense, lidar)
     lidar = _objects_of_lidar(frame, lidar)
@@ -139,26 +139,34 @@ def _without_smeared_pixels(frame: _StageFrame) -> NDArray[np.bool_]:
     keep = valid if frame.settings.sigma is None else sigma_filter(frame.completed, frame.settings.sigma)
     if frame.settings.sigma is not None:
         frame.count("sigma_filter", np.count_nonzero(valid), np.count_nonzero(keep))
-    frame.count("back_project", np.count_nonzero(keep), np.count_nonzero(keep))
     return keep
 
 
+def _points_of(frame: _StageFrame, keep: NDArray[np.bool_]) -> DenseCloud:
+    """5.3.1 and 5.3.4.2: back-projection, and a grid that makes the cloud equally dense near and far.
+
+    Both in one pass when nothing comes between them; the result is the same as of one after the other.
+    """
+    settings, pixels = frame.settings, int(np.count_nonzero(keep))
+    if settings.grid is None or settings.range_image is not None or not settings.completed:
+        return back_project(frame.completed.depth, frame.calibration, keep)
+    sampled = back_project_and_sample(frame.completed.depth, frame.calibration, keep, settings.grid)
+    frame.count("grid_sampling", pixels, len(sampled))
+    return sampled
+
+
 def _resampled_like_lidar(frame: _StageFrame, dense: DenseCloud) -> DenseCloud:
-    """Tables 5.5 and 5.7."""
-    if frame.settings.range_image is None or not frame.settings.completed:
+    """Tables 5.5 and 5.7: one point per beam, then the grid if there is one."""
+    settings = frame.settings
+    if settings.range_image is None or not settings.completed:
         return dense
-    sampled = dense.select(range_sample(dense.points, frame.settings.range_image))
+    sampled = dense.select(range_sample(dense.points, settings.range_image))
     frame.count("range_image", len(dense), len(sampled))
-    return sampled
-
-
-def _grid_sampled(frame: _StageFrame, dense: DenseCloud) -> DenseCloud:
-    """5.3.4.2: equally dense near and far."""
-    if frame.settings.grid is None or not frame.settings.completed:
-        return dense
-    sampled = grid_sampling(dense, frame.settings.grid)
-    frame.count("grid_sampling", len(dense), len(sampled))
-    return sampled
+    if settings.grid is None:
+        return sampled
+    gridded = grid_sampling(sampled, settings.grid)
+    frame.count("grid_sampling", len(sampled), len(gridded))
+    return gridded
 
 
 def _objects_and_context(frame: _StageFrame, dense: DenseCloud) -> DenseCloud:

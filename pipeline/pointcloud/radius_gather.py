@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.pointcloud.cells import mark_near
 
+
 @dataclass(frozen=True)
 class Radii:
     """r1 up to distance d, r2 beyond (thesis 5.3.4.3, Table 5.6).
