@@ -56,6 +56,9 @@ def _about_detections(detections: ObjectTable, target: Target) -> list[str]:
     boxes = detections.boxes_3d[same]
     if target.overlap != "2d" and ((boxes[:, 0] == -1000) | (boxes[:, 3] <= 0)).all():
         causes.append(f"the {target.cls} detections carry no 3D box (location -1000 or size -1): only 2D can be scored")
+    turned = float((np.abs(boxes[:, 6]) > 2 * np.pi).mean())
+    if target.overlap != "2d" and turned > _LEAST_SHARE:
+        causes.append(f"the yaw looks like degrees: {100 * turned:.0f} % of the {target.cls} detections exceed 2 pi")
     scores = detections.score[same]
     if len(scores) > 3 and np.ptp(scores) == 0:
         causes.append(f"all scores are {scores[0]:g}: the curve has a single point; write the detector's confidence")
@@ -68,27 +71,27 @@ def _about_geometry(pair: FramePair, target: Target) -> list[str]:
         return []
     least = min(target.iou, 0.5)
     as_written, total = _found(pair, target, least), int(pair.labels.is_type(target.cls).sum())
-    best, sentence = as_written, ""
+    tried = {}
     for words, change in _changes().items():
         changed = pair.detections.with_boxes_3d(change(pair.detections.boxes_3d))
-        found = _found(FramePair(pair.labels, changed), target, least)
-        if found > best:
-            best, sentence = found, words
-    if best < 2 * as_written or best - as_written < max(_LEAST_GAIN, _LEAST_SHARE * total):
+        tried[words] = _found(FramePair(pair.labels, changed), target, least)
+    sentence = max(tried, key=lambda words: tried[words])
+    best, before = tried[sentence][0], as_written[0]
+    if best < 2 * before or best - before < max(_LEAST_GAIN, _LEAST_SHARE * total):
         return []
     return [
-        f"{sentence}: undoing it, {best} instead of {as_written} of {total} {target.cls} labels "
+        f"{sentence}: undoing it, {best} instead of {before} of {total} {target.cls} labels "
         f"overlap a detection by more than {least:g} in 3D"
     ]
 
 
-def _found(pair: FramePair, target: Target, least: float) -> int:
-    """Labels of the class with a detection of the class of a 3D IoU above `least`."""
+def _found(pair: FramePair, target: Target, least: float) -> tuple[int, float]:
+    """Labels of the class with a detection of the class of a 3D IoU above `least`, and the sum of these IoUs."""
     overlaps = overlaps_of(pair.labels, pair.detections, "3d", floor=least)
     label_of_pair = np.repeat(np.arange(len(pair.labels)), np.diff(overlaps.start))
     same = pair.labels.is_type(target.cls)[label_of_pair]
     same &= pair.detections.is_type(target.cls)[overlaps.detection]
-    return len(np.unique(label_of_pair[same]))
+    return len(np.unique(label_of_pair[same])), float(overlaps.iou[same].sum())
 
 
 def _changes() -> dict[str, Change]:
@@ -99,7 +102,6 @@ def _changes() -> dict[str, Change]:
         "the yaw is a LiDAR heading, counter-clockwise from +x (ry = -heading - pi/2)": lambda b: _with(
             b, ry=-b[:, 6] - np.pi / 2
         ),
-        "the yaw is in degrees": lambda b: _with(b, ry=np.radians(b[:, 6])),
         "y is the centre of the box; KITTI wants the bottom (y + h/2)": lambda b: _with(b, y=b[:, 1] + b[:, 3] / 2),
         "y is the top of the box; KITTI wants the bottom (y + h)": lambda b: _with(b, y=b[:, 1] + b[:, 3]),
         "boxes are in the LiDAR frame (x forward, l w h, heading); KITTI wants the rectified camera": _from_lidar,

@@ -152,7 +152,7 @@ class _Story:
         any_class = max(pairs, key=lambda p: overlaps.iou[p])
         d, iou = int(overlaps.detection[best]), float(overlaps.iou[best])
         where = f"line {detections.line[d]}, IoU {iou:.3f}"
-        if iou <= self.target.iou and overlaps.iou[any_class] > self.target.iou:
+        if overlaps.iou[any_class] > self.target.iou and not (same[d] and iou > self.target.iou):
             d = int(overlaps.detection[any_class])
             return "wrong class", f"line {detections.line[d]} is {detections.types[detections.type[d]]}"
         if not same[d]:

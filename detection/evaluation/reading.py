@@ -221,14 +221,11 @@ def read_table(folder: Path, frames: Sequence[str], *, scored: bool, problems: P
         path = os.path.join(folder, f"{frame}.txt")
         kept = 0
         for number, fields in _file_lines(path):
-            parsed = _parse_fields(fields, width)
-            if parsed is None:
-                try:
-                    parse_line(" ".join(fields), where=f"{path}:{number}", scored=scored)
-                except ValueError as error:
-                    problems.report("broken line", str(error))
+            try:
+                numbers.extend(_numbers(fields, width, f"{path}:{number}", scored))
+            except ValueError as error:
+                problems.report("broken line", str(error))
                 continue
-            numbers.extend(parsed)
             names.append(fields[0])
             lines.append(number)
             kept += 1
@@ -251,13 +248,15 @@ def _file_lines(path: str) -> list[tuple[int, list[str]]]:
     return [(number, fields) for number, fields in enumerate(split, start=1) if fields]
 
 
-def _parse_fields(fields: list[str], width: int) -> list[float] | None:
-    """The numbers after the type, or None when the line is broken (count, text, NaN or infinity)."""
-    if len(fields) != width + 1:
-        return None
-    try:
-        numbers = list(map(float, fields[1:]))
-    except ValueError:
-        return None
-    # One sum is far cheaper than a test per number: it is finite only if all are (KITTI values never overflow it).
-    return numbers if math.isfinite(sum(numbers)) else None
+def _numbers(fields: list[str], width: int, where: str, scored: bool) -> list[float]:
+    """The numbers after the type. Raises ValueError naming the column when count, text or value is wrong."""
+    if len(fields) == width + 1:
+        try:
+            numbers = list(map(float, fields[1:]))
+        except ValueError:
+            numbers = [math.nan]
+        # One sum is far cheaper than a test per number: it is finite only if all of them are.
+        if math.isfinite(sum(numbers)):
+            return numbers
+    parse_line(" ".join(fields), where=where, scored=scored)
+    return list(map(float, fields[1:]))
