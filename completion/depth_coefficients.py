@@ -78,10 +78,8 @@ def encode(depth: Any, bins: Bins = OUTDOOR, method: str = "linear", beyond: str
     if method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
     if not isinstance(depth, Tensor):
-        values = np.asarray(depth)
-        tensor = torch.from_numpy(
-            np.ascontiguousarray(values, np.float64 if values.dtype == np.float64 else np.float32)
-        )
+        kind = np.float64 if np.asarray(depth).dtype == np.float64 else np.float32
+        tensor = torch.from_numpy(np.array(depth, kind, order="C"))
         return encode(tensor, bins, method, beyond).numpy()
     channels, weights = sparse_code(depth, bins, method, beyond)
     code = torch.zeros((*depth.shape, bins.channels), dtype=weights.dtype, device=depth.device)
@@ -141,7 +139,7 @@ def decode(coefficients: Any, bins: Bins = OUTDOOR, which: str = "all", strict_r
     if which not in DECODINGS:
         raise ValueError(f"which: expected one of {', '.join(DECODINGS)}, got {which!r}")
     if not isinstance(coefficients, Tensor):
-        return decode(torch.from_numpy(np.ascontiguousarray(coefficients)), bins, which, strict_reference).numpy()
+        return decode(torch.from_numpy(np.array(coefficients, order="C")), bins, which, strict_reference).numpy()
     if coefficients.shape[-1] != bins.channels:
         raise ValueError(f"expected {bins.channels} coefficients in the last axis, got {tuple(coefficients.shape)}")
     numbers = torch.arange(bins.channels, device=coefficients.device, dtype=coefficients.dtype) + bins.first

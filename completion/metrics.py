@@ -71,7 +71,7 @@ def depth_metrics(
     strict_reference  predictions of 0 give infinite inverse and NaN logarithmic metrics, as in the reference codes
 
     Keys: mae_mm, rmse_mm, tmae_mm, trmse_mm; imae_per_km, irmse_per_km; rel, squared_rel (mean of (error / target)^2);
-    delta_1.02, _1.05, _1.10, _1.25, _1.25^2, _1.25^3 in percent; lg10; silog (100 sqrt(var(ln g - ln p))); valid_pixels;
+    delta_1.02, _1.05, _1.10, _1.25, _1.25^2, _1.25^3 in percent; lg10; silog; valid_pixels;
     floored_pixels (predictions below 0.1 m raised to it for the inverse and logarithmic metrics).
     ValueError for shapes that differ, unknown rules, or no valid pixel.
     """

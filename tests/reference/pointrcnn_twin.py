@@ -1,0 +1,181 @@
+"""PointRCNN written the long way from its description: planar 1x1 convolutions on a plain state dict, loops for boxes.
+
+Shares nothing with `detection.models` but the names of the weights.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from tests.reference.ops_points import ball_query, furthest_point_sample, three_nn
+
+LEVELS = [(4096, (0.1, 0.5), (16, 32)), (1024, (0.5, 1.0), (16, 32)), (256, (1.0, 2.0), (16, 32)), (64, (2.0, 4.0), (16, 32))]
+
+
+def conv(state: dict[str, Tensor], prefix: str, x: Tensor, relu: bool = True) -> Tensor:
+    """(C, ...) -> (C', ...): convolution, batch normalisation in eval mode when there is one, ReLU."""
+    weight = state[f"{prefix}.conv.weight"].flatten(1)
+    y = torch.einsum("oc,c...->o...", weight, x)
+    shape = [-1] + [1] * (x.dim() - 1)
+    if f"{prefix}.conv.bias" in state:
+        y = y + state[f"{prefix}.conv.bias"].view(shape)
+    if f"{prefix}.bn.bn.weight" in state:
+        mean, var = state[f"{prefix}.bn.bn.running_mean"].view(shape), state[f"{prefix}.bn.bn.running_var"].view(shape)
+        y = (y - mean) / (var + 1e-5).sqrt()
+        y = y * state[f"{prefix}.bn.bn.weight"].view(shape) + state[f"{prefix}.bn.bn.bias"].view(shape)
+    return F.relu(y) if relu else y
+
+
+def mlp(state: dict[str, Tensor], prefix: str, x: Tensor) -> Tensor:
+    """layer0, layer1, ... in turn."""
+    k = 0
+    while f"{prefix}.layer{k}.conv.weight" in state:
+        x = conv(state, f"{prefix}.layer{k}", x)
+        k += 1
+    return x
+
+
+def set_abstraction(
+    state: dict[str, Tensor],
+    prefix: str,
+    xyz: Tensor,
+    features: Tensor | None,
+    level: tuple[int, tuple[float, ...], tuple[int, ...]],
+) -> tuple[Tensor, Tensor]:
+    """xyz (N, 3), features (C, N) -> centres (M, 3), features (C', M)."""
+    points, radii, counts = level
+    centres = xyz[torch.as_tensor(furthest_point_sample(xyz.numpy(), points))]
+    out = []
+    for branch, (radius, count) in enumerate(zip(radii, counts)):
+        index = torch.as_tensor(ball_query(xyz.numpy(), centres.numpy(), radius, count))
+        group = (xyz[index] - centres[:, None]).permute(2, 0, 1)
+        if features is not None:
+            group = torch.cat([group, features[:, index]])
+        out.append(mlp(state, f"{prefix}.mlps.{branch}", group).amax(dim=2))
+    return centres, torch.cat(out)
+
+
+def backbone(state: dict[str, Tensor], points: Tensor) -> Tensor:
+    """points (N, 3 + E) -> (128, N)."""
+    prefix = "rpn.backbone_net"
+    xyz = [points[:, :3].contiguous()]
+    features = [points[:, 3:].T.contiguous() if points.shape[1] > 3 else None]
+    for k, level in enumerate(LEVELS):
+        centres, described = set_abstraction(state, f"{prefix}.SA_modules.{k}", xyz[-1], features[-1], level)
+        xyz.append(centres)
+        features.append(described)
+    for k in (3, 2, 1, 0):
+        distance, index = three_nn(xyz[k].numpy(), xyz[k + 1].numpy())
+        inverse = 1 / (torch.as_tensor(distance) + 1e-8)
+        weight = (inverse / inverse.sum(dim=1, keepdim=True)).float()
+        known = features[k + 1]
+        assert known is not None
+        mixed = (known[:, torch.as_tensor(index)] * weight).sum(dim=2)
+        skip = features[k]
+        features[k] = mlp(state, f"{prefix}.FP_modules.{k}.mlp", mixed if skip is None else torch.cat([mixed, skip]))
+    assert features[0] is not None
+    return features[0]
+
+
+def heads(state: dict[str, Tensor], features: Tensor) -> tuple[Tensor, Tensor]:
+    """(128, N) -> class logits (N,), codes (N, C)."""
+    out = []
+    for name in ("rpn.rpn_cls_layer", "rpn.rpn_reg_layer"):
+        out.append(conv(state, f"{name}.2", conv(state, f"{name}.0", features), relu=False))
+    return out[0][0], out[1].T
+
+
+def decode(code: np.ndarray, scope: float, head_bins: int, fine: bool, soft: bool, folded: bool) -> list[float]:
+    """One code -> dx dy dz h w l ry relative to its anchor, number by number."""
+    n, size = int(scope / 0.5) * 2, 0.5
+    at = 0
+
+    def take(count: int) -> np.ndarray:
+        nonlocal at
+        at += count
+        return code[at - count : at].astype(np.float64)
+
+    x_bin, z_bin = take(n), take(n)
+    x_res, z_res = (take(n), take(n)) if fine else (np.zeros(n), np.zeros(n))
+
+    def place(logits: np.ndarray, residual: np.ndarray) -> float:
+        positions = [k * size + size / 2 - scope + residual[k] * size for k in range(n)]
+        if not soft:
+            return positions[int(np.argmax(logits))]
+        weights = np.exp(logits - logits.max())
+        return float((weights / weights.sum() * positions).sum())
+
+    dx, dz, dy = place(x_bin, x_res), place(z_bin, z_res), float(take(1)[0])
+    ry_bin, ry_res = take(head_bins), take(head_bins)
+    best = int(np.argmax(ry_bin))
+    if folded:
+        per = (math.pi / 2) / head_bins
+        ry = best * per + per / 2 + ry_res[best] * per / 2 - math.pi / 4
+    else:
+        per = 2 * math.pi / head_bins
+        ry = (best * per + ry_res[best] * per / 2) % (2 * math.pi)
+        ry = ry - 2 * math.pi if ry > math.pi else ry
+    mean = (1.52563191462, 1.62856739989, 3.88311640418)
+    h, w, l = (r * m + m for r, m in zip(take(3), mean))
+    return [dx, dy, dz, h, w, l, ry]
+
+
+def proposal_boxes(points: Tensor, codes: Tensor, fine: bool, soft: bool) -> np.ndarray:
+    """(N, 7) boxes with bottom centres."""
+    rows = []
+    for point, code in zip(points[:, :3].double().numpy(), codes.numpy()):
+        dx, dy, dz, h, w, l, ry = decode(code, 3.0, 12, fine, soft, folded=False)
+        rows.append([point[0] + dx, point[1] + dy + h / 2, point[2] + dz, h, w, l, ry])
+    return np.array(rows)
+
+
+def pool(points: Tensor, extra: Tensor, roi: np.ndarray, margin: float) -> Tensor | None:
+    """(512, 3 + C) the first points inside the enlarged RoI, repeated in a cycle; None when it is empty."""
+    x, y, z, h, w, l, ry = roi
+    inside = []
+    for k, (px, py, pz) in enumerate(points[:, :3].double().numpy()):
+        along = (px - x) * math.cos(ry) - (pz - z) * math.sin(ry)
+        across = (px - x) * math.sin(ry) + (pz - z) * math.cos(ry)
+        near = abs(px - x) <= 10 and abs(pz - z) <= 10
+        level = y + margin - (h + 2 * margin) <= py <= y + margin
+        if near and level and abs(along) <= l / 2 + margin and abs(across) <= w / 2 + margin:
+            inside.append(k)
+    if not inside:
+        return None
+    chosen = [inside[k % len(inside)] for k in range(512)] if len(inside) < 512 else inside[:512]
+    return torch.cat([points[:, :3], extra], dim=1)[chosen]
+
+
+def refine(
+    state: dict[str, Tensor], points: Tensor, logits: Tensor, features: Tensor, roi: np.ndarray, mask: float, margin: float,
+    soft: bool,
+) -> tuple[float, np.ndarray]:
+    """Logit and refined box (7,) of one RoI."""
+    flag = (logits.sigmoid() > mask).float()[:, None]
+    depth = points[:, :3].norm(dim=1, keepdim=True) / 70 - 0.5
+    pooled = pool(points, torch.cat([flag, depth, features.T], dim=1), roi, margin)
+    pooled = torch.zeros(512, 133) if pooled is None else pooled.clone()
+    x, y, z, _, _, _, ry = roi
+    dx, dy, dz = pooled[:, 0] - x, pooled[:, 1] - y, pooled[:, 2] - z
+    pooled[:, 0] = dx * math.cos(ry) - dz * math.sin(ry)
+    pooled[:, 1] = dy
+    pooled[:, 2] = dx * math.sin(ry) + dz * math.cos(ry)
+    xyz = pooled[:, :3].contiguous()
+    local = mlp(state, "rcnn_net.xyz_up_layer", pooled[:, :5].T)
+    merged = mlp(state, "rcnn_net.merge_down_layer", torch.cat([local, pooled[:, 5:].T]))
+    for k, level in enumerate([(128, (0.2,), (64,)), (32, (0.4,), (64,))]):
+        xyz, merged = set_abstraction(state, f"rcnn_net.SA_modules.{k}", xyz, merged, level)
+    described = mlp(state, "rcnn_net.SA_modules.2.mlps.0", torch.cat([xyz.T, merged])).amax(dim=1, keepdim=True)
+    out = []
+    for name in ("rcnn_net.cls_layer", "rcnn_net.reg_layer"):
+        hidden = conv(state, f"{name}.2", conv(state, f"{name}.0", described))
+        out.append(conv(state, f"{name}.3", hidden, relu=False)[:, 0])
+    dx, dy, dz, h, w, l, dry = decode(out[1].numpy(), 1.5, 9, True, soft, folded=True)
+    box_x = x + dx * math.cos(ry) + dz * math.sin(ry)
+    box_z = z - dx * math.sin(ry) + dz * math.cos(ry)
+    return float(out[0][0]), np.array([box_x, y + dy, box_z, h, w, l, ry + dry])
