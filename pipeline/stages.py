@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pipeline.config import Config
 from pipeline.data import Dataset, Frame, open_dataset
 from pipeline.data.depth_png import read_depth_png
-from pipeline.errors import DataError, UsageError
+from pipeline.errors import UsageError
 from pipeline.frame_files import FrameFiles
 from pipeline.paths import RunFolder
 from pipeline.runner.seeds import derive_seed
@@ -121,11 +121,12 @@ def completed_depth(config: Config, frame: Frame, files: FrameFiles) -> Complete
 
     if config.augment.depth_from is None:
         return files.read_completed()
+    from pipeline.pointcloud.depth_source import placed_bottom_centre
+
     path = Path(config.augment.depth_from) / f"{frame.id}.png"
     depth = read_depth_png(path)
     if depth.shape != tuple(frame.image_size):
-        hint = "was it cropped? pad it back to the full image first"
-        raise DataError(path, f"a depth map of the image's size {frame.image_size}", f"{depth.shape}", hint)
+        depth = placed_bottom_centre(depth, frame.image_size, path)
     return CompletedDepth(depth)
 
 
@@ -135,7 +136,7 @@ def with_sigma(completed: CompletedDepth, settings: AugmentSettings) -> Complete
         return completed
     from pipeline.pointcloud.pseudo_sigma import pseudo_sigma
 
-    return pseudo_sigma(completed)
+    return pseudo_sigma(completed.depth)
 
 
 def _augment_settings_record(config: Config) -> Any:

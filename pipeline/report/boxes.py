@@ -1,0 +1,88 @@
+"""Boxes as SVG paths: wireframes in the image, footprints from above."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detection.boxes import corners
+from detection.kitti_format import KittiObject, boxes_of
+from pipeline.data.calibration import Calibration
+from pipeline.report.pictures import BirdsEye
+
+# Pairs of corners (order of detection.boxes.corners: bottom face, then top face) that make the twelve edges.
+EDGES = (
+    [(i, (i + 1) % 4) for i in range(4)] + [(i + 4, (i + 1) % 4 + 4) for i in range(4)] + [(i, i + 4) for i in range(4)]
+)
+MIN_DEPTH = 0.3
+DRAWN = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
+
+
+@dataclass(frozen=True)
+class DrawnBox:
+    """One object: SVG path data in image pixels and in bird's-eye pixels, and the text shown when pointed at."""
+
+    kind: str
+    image_path: str
+    bev_path: str
+    title: str
+    score: float | None
+
+
+def drawn_boxes(objects: Sequence[KittiObject], calibration: Calibration, size: tuple[int, int]) -> list[DrawnBox]:
+    """Paths of all objects that have a 3D box; `size` is (height, width) of the image in pixels."""
+    solid = [item for item in objects if item.type in DRAWN and min(item.size) > 0]
+    corner_sets = corners(boxes_of(solid))
+    return [
+        DrawnBox(
+            item.type, wireframe(points, calibration, size), footprint(points, calibration), _title(item), item.score
+        )
+        for item, points in zip(solid, corner_sets)
+    ]
+
+
+def _title(item: KittiObject) -> str:
+    distance = f"{item.location[2]:.1f} m"
+    if item.score is None:
+        return f"true {item.type}, {distance}, occluded {item.occluded}, truncated {item.truncated:.2f}"
+    return f"predicted {item.type}, {distance}, score {item.score:.2f}"
+
+
+def wireframe(points: NDArray[np.float64], calibration: Calibration, size: tuple[int, int]) -> str:
+    """Path data of the twelve edges; parts behind the camera are cut off at 0.3 m. Empty when nothing is visible.
+
+    points  (8, 3) corners in the rectified camera frame, metres
+    """
+    height, width = size
+    lines: list[str] = []
+    for first, second in EDGES:
+        edge = _in_front(points[first], points[second])
+        if edge is None:
+            continue
+        (u1, v1), (u2, v2) = calibration.cam_to_image(edge)[0]
+        outside = max(u1, u2) < 0 or min(u1, u2) > width or max(v1, v2) < 0 or min(v1, v2) > height
+        if not outside:
+            lines.append(f"M{u1:.1f} {v1:.1f}L{u2:.1f} {v2:.1f}")
+    return "".join(lines)
+
+
+def _in_front(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """The part of the segment a-b with z >= MIN_DEPTH, or None."""
+    if a[2] < MIN_DEPTH and b[2] < MIN_DEPTH:
+        return None
+    if a[2] < MIN_DEPTH:
+        a = a + (b - a) * (MIN_DEPTH - a[2]) / (b[2] - a[2])
+    elif b[2] < MIN_DEPTH:
+        b = b + (a - b) * (MIN_DEPTH - b[2]) / (a[2] - b[2])
+    return np.stack([a, b])
+
+
+def footprint(points: NDArray[np.float64], calibration: Calibration) -> str:
+    """Path data of the bottom face from above, with a line from the centre to the middle of the front edge."""
+    place = BirdsEye().pixels(calibration.cam_to_velo(points[:4]))
+    centre, front = place.mean(axis=0), (place[0] + place[1]) / 2
+    outline = "L".join(f"{x:.1f} {y:.1f}" for x, y in place)
+    return f"M{outline}ZM{centre[0]:.1f} {centre[1]:.1f}L{front[0]:.1f} {front[1]:.1f}"
