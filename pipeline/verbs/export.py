@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
             raise UsageError(f"{args.run}: no frame of {args.data} in it (expected depth/ID.png or cloud/ID.bin)")
     compat = frozenset(name.strip() for name in args.compat.split(",") if name.strip())
     options = Options(args.virtual, compat, args.images)
-    workers = args.workers or min(default_workers(), len(dataset))
+    workers = args.workers or default_workers(len(dataset))
     summary = export(dataset, args.run, args.out, args.format, options, workers)
     numbers = [f"{summary.frames} frames", *(f"{count} {name}" for name, count in summary.counts.items())]
     numbers += [f"largest {name} {value:.3g}" for name, value in summary.largest.items()]

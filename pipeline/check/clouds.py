@@ -1,0 +1,96 @@
+"""Checks of one point cloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.check.faults import Finding
+
+ROW = 16
+# LiDARs of cars end at 120-250 m; the median return of a street lies at 10-20 m.
+_MILLIMETRE_MEDIAN = 300.0
+# Beyond this share of values that float16 holds exactly, the cloud went through float16 (measured: 0.0-0.3 % on KITTI).
+_FLOAT16_SHARE = 0.99
+_FEWEST = 100
+
+
+@dataclass(frozen=True)
+class CloudFacts:
+    """Numbers of one cloud that are compared over the frames.
+
+    count  points
+    floor  elevation in degrees below which 2 % of the points lie (a whole KITTI cloud: -18 to -20)
+    """
+
+    count: int
+    floor: float
+
+
+def read_raw_cloud(path: Path, frame: str) -> tuple[NDArray[np.float32] | None, list[Finding]]:
+    """(N, 4) values of a .bin file as stored, or None with the reason why they cannot be used."""
+    data = path.read_bytes()
+    if not data:
+        return None, [Finding("empty_file", frame, str(path), "0 bytes")]
+    if len(data) % ROW:
+        message = f"{len(data)} bytes are not a multiple of {ROW} (float32 x y z intensity)"
+        return None, [Finding("truncated_cloud", frame, str(path), message)]
+    return np.frombuffer(data, dtype="<f4").reshape(-1, 4), []
+
+
+def check_cloud(points: NDArray[np.floating], frame: str, where: str) -> list[Finding]:
+    """Faults of a cloud's contents; points (N, 3+) x y z [intensity ...], LiDAR frame, metres. One cause at most."""
+    bad = ~np.isfinite(points).all(axis=1)
+    if bad.any():
+        message = f"{int(bad.sum())} of {len(points)} points hold NaN or infinite values (first: {int(bad.argmax())})"
+        return [Finding("non_finite_points", frame, where, message)]
+    if len(points) < _FEWEST:
+        return []
+    distance = np.linalg.norm(points[:, :3].astype(np.float64), axis=1)
+    middle = float(np.median(distance))
+    if middle > _MILLIMETRE_MEDIAN:
+        message = f"half of the points are farther than {middle:.0f} m"
+        return [Finding("cloud_in_millimetres", frame, where, message)]
+    order = _vertical_axis(points)
+    if order != 2:
+        message = f"the flat axis is {'xyz'[order]} (column {order + 1}), expected z (column 3)"
+        return [Finding("axis_order", frame, where, message)]
+    if points.dtype == np.float32 and _float16_share(points) > _FLOAT16_SHARE:
+        share = 100 * _float16_share(points)
+        return [Finding("float16_loss", frame, where, f"{share:.1f} % of the coordinates are exact float16 values")]
+    if points.shape[1] > 3 and float(np.percentile(points[:, 3], 99)) > 1.5:
+        message = f"1 % of the intensities exceed {float(np.percentile(points[:, 3], 99)):.4g}, expected 0..1"
+        return [Finding("intensity_scale", frame, where, message)]
+    return []
+
+
+def _vertical_axis(points: NDArray[np.floating]) -> int:
+    """The column in which a street is flat: the smallest spread between the 10th and 90th percentile.
+
+    2 unless another column is much flatter, so that narrow canyons and indoor rooms do not count.
+    """
+    low, high = np.percentile(points[:, :3], [10, 90], axis=0)
+    spread = high - low
+    flattest = int(np.argmin(spread))
+    return flattest if spread[flattest] < 0.6 * spread[2] else 2
+
+
+def _float16_share(points: NDArray[np.floating]) -> float:
+    """Share of the coordinates that float16 holds exactly, zeros left out."""
+    values = points[:, :3][points[:, :3] != 0]
+    if values.size == 0:
+        return 0.0
+    with np.errstate(over="ignore"):
+        return float((values.astype(np.float16).astype(np.float32) == values).mean())
+
+
+def cloud_facts(points: NDArray[np.floating]) -> CloudFacts:
+    """The numbers of a sound cloud."""
+    if len(points) == 0:
+        return CloudFacts(0, 0.0)
+    x, y, z = points[:, :3].astype(np.float64).T
+    elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
+    return CloudFacts(len(points), float(np.percentile(elevation, 2)))
