@@ -3,8 +3,8 @@
     OMP_NUM_THREADS=1 taskset -c 0 python -m benchmarks.pointcloud
     OMP_NUM_THREADS=2 taskset -c 0,1 python -m benchmarks.pointcloud
 
-The same four steps on the same frame, alternating in one process. Peers get float32 arithmetic, precomputed rays, and as
-many SciPy and Open3D threads as there are cores; ours uses one thread. "equal" means the same points in the same order
+The same four steps on the same frame, alternating in one process. Peers get float32 arithmetic, precomputed rays, and
+as many SciPy and Open3D threads as there are cores; ours uses one thread. "equal" means the same points in the same order
 (first), up to ties (nearest); Open3D anchors its grid at the cloud's corner, so its centroids cannot be compared.
 """
 
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -163,7 +164,7 @@ def run(repeats: int) -> list[Comparison]:
         check = None if representative == "centroid" else agree
         others = peers(frame, representative, workers)
         rows.append(
-            compare(f"four steps, {representative}", lambda: ours(frame, representative), others, repeats, check)
+            compare(f"four steps, {representative}", partial(ours, frame, representative), others, repeats, check)
         )
     return rows
 

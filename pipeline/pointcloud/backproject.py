@@ -63,7 +63,7 @@ def back_project(depth: NDArray[np.float32], calibration: Calibration, keep: NDA
 
 
 def usable_pixels(depth: NDArray[np.float32], keep: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """The depth map, contiguous, and the pixels to take: marked by `keep` and with a value. Raises as `back_project`."""
+    """The depth map, contiguous, and the pixels to take: marked and with a value. Raises as `back_project`."""
     if depth.ndim != 2 or depth.shape != keep.shape:
         raise DataError("back-projection", f"an (H, W) depth map like the {keep.shape} mask", f"shape {depth.shape}")
     depth = np.ascontiguousarray(depth, dtype=np.float32)

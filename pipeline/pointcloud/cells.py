@@ -204,7 +204,7 @@ def _refill(table, keys, count):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _sort_by_cell(anchors, run_start, run_cell, starts, members, bounds):  # type: ignore[no-untyped-def]
-    """Counting sort: the anchors of cell c become members[:, starts[c] : starts[c + 1]] within bounds[c] (low, high)."""
+    """Counting sort: the anchors of cell c become members[:, starts[c] : starts[c + 1]], within bounds[c]."""
     for run in range(run_cell.size):
         starts[run_cell[run] + 1] += run_start[run + 1] - run_start[run]
     for cell in range(starts.size - 1):

@@ -37,8 +37,8 @@ def grid_sample(points: NDArray[np.float32], grid: GridSampling) -> NDArray[np.i
     """(N, 3) points -> (M,) index of the representative of every occupied cell, in order of first appearance.
 
     A point lies in cell floor(coordinate * (1 / size)), computed in float64. The centroid is the float64 mean of the
-    points rounded to 15 nm (see `settle`); of equally near points the first wins. For "centroid" the index is that of the first point,
-    whose pixel the mean takes (see `grid_sampling`).
+    points rounded to 15 nm (see `settle`); of equally near points the first wins. For "centroid" the index is that of
+    the first point, whose pixel the mean takes (see `grid_sampling`).
 
     Raises ValueError for NaN or infinite coordinates.
     """
