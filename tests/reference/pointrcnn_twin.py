@@ -1,6 +1,6 @@
 """PointRCNN written the long way from its description: planar 1x1 convolutions on a plain state dict, loops for boxes.
 
-Shares nothing with `detection.models` but the names of the weights.
+Shares nothing with `detection.models` but the names of the weights; the point operations have twins of their own.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from tests.reference.ops_points import ball_query, furthest_point_sample, three_nn
+from detection.ops import ball_query, furthest_point_sample, three_nn
 
-LEVELS = [(4096, (0.1, 0.5), (16, 32)), (1024, (0.5, 1.0), (16, 32)), (256, (1.0, 2.0), (16, 32)), (64, (2.0, 4.0), (16, 32))]
+RADII = ((0.1, 0.5), (0.5, 1.0), (1.0, 2.0), (2.0, 4.0))
+LEVELS = [(points, radii, (16, 32)) for points, radii in zip((4096, 1024, 256, 64), RADII)]
 
 
 def conv(state: dict[str, Tensor], prefix: str, x: Tensor, relu: bool = True) -> Tensor:
@@ -49,10 +50,10 @@ def set_abstraction(
 ) -> tuple[Tensor, Tensor]:
     """xyz (N, 3), features (C, N) -> centres (M, 3), features (C', M)."""
     points, radii, counts = level
-    centres = xyz[torch.as_tensor(furthest_point_sample(xyz.numpy(), points))]
+    centres = xyz[furthest_point_sample(xyz, points)]
     out = []
     for branch, (radius, count) in enumerate(zip(radii, counts)):
-        index = torch.as_tensor(ball_query(xyz.numpy(), centres.numpy(), radius, count))
+        index = ball_query(xyz, centres, radius, count)
         group = (xyz[index] - centres[:, None]).permute(2, 0, 1)
         if features is not None:
             group = torch.cat([group, features[:, index]])
@@ -70,12 +71,12 @@ def backbone(state: dict[str, Tensor], points: Tensor) -> Tensor:
         xyz.append(centres)
         features.append(described)
     for k in (3, 2, 1, 0):
-        distance, index = three_nn(xyz[k].numpy(), xyz[k + 1].numpy())
-        inverse = 1 / (torch.as_tensor(distance) + 1e-8)
+        distance, index = three_nn(xyz[k], xyz[k + 1])
+        inverse = 1 / (distance + 1e-8)
         weight = (inverse / inverse.sum(dim=1, keepdim=True)).float()
         known = features[k + 1]
         assert known is not None
-        mixed = (known[:, torch.as_tensor(index)] * weight).sum(dim=2)
+        mixed = (known[:, index] * weight).sum(dim=2)
         skip = features[k]
         features[k] = mlp(state, f"{prefix}.FP_modules.{k}.mlp", mixed if skip is None else torch.cat([mixed, skip]))
     assert features[0] is not None
@@ -152,7 +153,13 @@ def pool(points: Tensor, extra: Tensor, roi: np.ndarray, margin: float) -> Tenso
 
 
 def refine(
-    state: dict[str, Tensor], points: Tensor, logits: Tensor, features: Tensor, roi: np.ndarray, mask: float, margin: float,
+    state: dict[str, Tensor],
+    points: Tensor,
+    logits: Tensor,
+    features: Tensor,
+    roi: np.ndarray,
+    mask: float,
+    margin: float,
     soft: bool,
 ) -> tuple[float, np.ndarray]:
     """Logit and refined box (7,) of one RoI."""
