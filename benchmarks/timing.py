@@ -44,7 +44,7 @@ class Comparison:
     def __str__(self) -> str:
         parts = [f"{self.name}: ours {_milliseconds(self.ours)}"]
         for peer in self.peers:
-            verdict = {True: ", equal", False: ", DIFFERENT", None: ""}[self.checks.get(peer.label)]
+            verdict = {True: ", agrees", False: ", DISAGREES", None: ""}[self.checks.get(peer.label)]
             parts.append(f"{peer.label} {_milliseconds(peer)} ({self.ratio(peer.label):.2f}x{verdict})")
         return " | ".join(parts)
 
@@ -112,7 +112,7 @@ def format_table(rows: Iterable[Comparison]) -> str:
         if not row.peers:
             lines.append(f"| {row.name} | {_milliseconds(row.ours)} | - | - | - | - | {threads} |")
         for peer in row.peers:
-            verdict = {True: "equal", False: "DIFFERENT", None: "not compared"}[row.checks.get(peer.label)]
+            verdict = {True: "agree", False: "DISAGREE", None: "not compared"}[row.checks.get(peer.label)]
             lines.append(
                 f"| {row.name} | {_milliseconds(row.ours)} | {peer.label} | {_milliseconds(peer)} "
                 f"| {row.ratio(peer.label):.2f} | {verdict} | {threads} |"

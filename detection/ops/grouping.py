@@ -34,14 +34,14 @@ def ball_query(xyz: Tensor, centres: Tensor, radius: float, nsample: int) -> Ten
     if points.device.type != "cpu":
         return unbatched(_torch_points.ball_query(points, places, float(radius2), nsample), single)
 
-    from detection.ops import _neighbour_kernels
+    from detection.ops import _bucket_kernels
     from detection.ops._numba import for_blocks
 
     index = torch.empty(*places.shape[:2], nsample, dtype=torch.int64)
     source, around, target = points.numpy(), places.numpy(), index.numpy()
 
     def query(b: slice, p: slice) -> None:
-        _neighbour_kernels.ball_query(source[b], around[b, p], radius2, target[b, p])
+        _bucket_kernels.ball_query(source[b], around[b, p], radius2, target[b, p])
 
     for_blocks(query, (around.shape[0], around.shape[1]), torch.get_num_threads(), _CENTRES)
     return unbatched(index, single)
@@ -62,7 +62,7 @@ def group_points(features: Tensor, index: Tensor) -> Tensor:
         index = index[None]
     check_same_batch(columns, "features", index, "index")
     batch, channels, count = columns.shape
-    rows = columns.transpose(1, 2).reshape(batch * count, channels)
+    rows = columns.transpose(1, 2).contiguous().view(batch * count, channels)  # embedding is slow on strided rows
     offsets = (torch.arange(batch, device=index.device) * count).view(-1, *[1] * (index.ndim - 1))
     grouped = torch.nn.functional.embedding(index + offsets, rows)  # (B, ..., C)
     return unbatched(grouped.movedim(-1, 1), single)

@@ -32,14 +32,14 @@ def three_nn(unknown: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _three_nn_cpu(queries: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    from detection.ops import _neighbour_kernels
+    from detection.ops import _bucket_kernels
     from detection.ops._numba import for_blocks
 
     squared, index = torch.empty_like(queries), torch.empty(queries.shape, dtype=torch.int64)
     source, known, distance, nearest = queries.numpy(), points.numpy(), squared.numpy(), index.numpy()
 
     def query(b: slice, n: slice) -> None:
-        _neighbour_kernels.three_nn(source[b, n], known[b], distance[b, n], nearest[b, n])
+        _bucket_kernels.three_nn(source[b, n], known[b], distance[b, n], nearest[b, n])
 
     for_blocks(query, (source.shape[0], source.shape[1]), torch.get_num_threads(), _QUERIES)
     return squared, index
@@ -70,7 +70,7 @@ def three_interpolate(features: Tensor, index: Tensor, weight: Tensor) -> Tensor
             f"index and weight: expected equal shapes, got {tuple(index.shape)} and {tuple(weights.shape)}"
         )
     batch, channels, count = columns.shape
-    rows = columns.transpose(1, 2).reshape(batch * count, channels)
+    rows = columns.transpose(1, 2).contiguous().view(batch * count, channels)  # embedding is slow on strided rows
     offsets = (torch.arange(batch, device=index.device) * count).view(-1, 1, 1)
     flat = (index + offsets).reshape(-1, 3)
     summed = torch.nn.functional.embedding_bag(

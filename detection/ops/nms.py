@@ -7,64 +7,10 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from detection.ops._numba import kernel
-from detection.ops.rotated_iou import bev_iou, checked_boxes, is_tensor
+from detection.ops.rotated_iou import checked_boxes, is_tensor, keep_aligned, keep_rotated
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-Array = NDArray[np.float64]
-
-
-@kernel
-def _aligned_iou(box_a: Array, box_b: Array) -> float:
-    """Intersection over union of the rectangles x -+ l/2, z -+ w/2, as if ry were 0."""
-    shared_x = min(box_a[0] + box_a[5] / 2, box_b[0] + box_b[5] / 2) - max(
-        box_a[0] - box_a[5] / 2, box_b[0] - box_b[5] / 2
-    )
-    shared_z = min(box_a[2] + box_a[4] / 2, box_b[2] + box_b[4] / 2) - max(
-        box_a[2] - box_a[4] / 2, box_b[2] - box_b[4] / 2
-    )
-    if shared_x <= 0.0 or shared_z <= 0.0:
-        return 0.0
-    shared = shared_x * shared_z
-    return shared / (box_a[4] * box_a[5] + box_b[4] * box_b[5] - shared)
-
-
-@kernel
-def _keep_rotated(boxes: Array, threshold: float, keep: Any) -> int:
-    """Go through boxes from the best score on; write the rows that survive to `keep` until it is full."""
-    kept = 0
-    for candidate in range(boxes.shape[0]):
-        if kept == keep.size:
-            break
-        survives = True
-        for k in range(kept):
-            if bev_iou(boxes[keep[k]], boxes[candidate]) > threshold:
-                survives = False
-                break
-        if survives:
-            keep[kept] = candidate
-            kept += 1
-    return kept
-
-
-@kernel
-def _keep_aligned(boxes: Array, threshold: float, keep: Any) -> int:
-    """As `_keep_rotated` with unrotated rectangles."""
-    kept = 0
-    for candidate in range(boxes.shape[0]):
-        if kept == keep.size:
-            break
-        survives = True
-        for k in range(kept):
-            if _aligned_iou(boxes[keep[k]], boxes[candidate]) > threshold:
-                survives = False
-                break
-        if survives:
-            keep[kept] = candidate
-            kept += 1
-    return kept
 
 
 def _suppress(keep_kernel: Any, boxes: Any, scores: Any, threshold: float, limit: int | None) -> Any:
@@ -102,7 +48,7 @@ def nms_rotated(boxes: Any, scores: Any, threshold: float, limit: int | None = N
     Returns (K,) int64 indices into `boxes`, best score first, of the kind and device of `boxes`.
     Raises ValueError for other shapes, boxes that are not finite, or NaN scores.
     """
-    return _suppress(_keep_rotated, boxes, scores, threshold, limit)
+    return _suppress(keep_rotated, boxes, scores, threshold, limit)
 
 
 @overload
@@ -116,4 +62,4 @@ def nms_axis_aligned(boxes: Any, scores: Any, threshold: float, limit: int | Non
 
     This is the "normal" NMS that PointRCNN and EPNet run on their proposals.
     """
-    return _suppress(_keep_aligned, boxes, scores, threshold, limit)
+    return _suppress(keep_aligned, boxes, scores, threshold, limit)

@@ -125,6 +125,57 @@ def _volume_rows(boxes_a: Array, boxes_b: Array, out: Array) -> None:
         out[i] = volume_iou(boxes_a[i], boxes_b[i])
 
 
+@kernel
+def _aligned_iou(box_a: Array, box_b: Array) -> float:
+    """Intersection over union of the rectangles x -+ l/2, z -+ w/2, as if ry were 0."""
+    shared_x = min(box_a[0] + box_a[5] / 2, box_b[0] + box_b[5] / 2) - max(
+        box_a[0] - box_a[5] / 2, box_b[0] - box_b[5] / 2
+    )
+    shared_z = min(box_a[2] + box_a[4] / 2, box_b[2] + box_b[4] / 2) - max(
+        box_a[2] - box_a[4] / 2, box_b[2] - box_b[4] / 2
+    )
+    if shared_x <= 0.0 or shared_z <= 0.0:
+        return 0.0
+    shared = shared_x * shared_z
+    return shared / (box_a[4] * box_a[5] + box_b[4] * box_b[5] - shared)
+
+
+@kernel
+def keep_rotated(boxes: Array, threshold: float, keep: Any) -> int:
+    """Go through boxes from the best score on; write the rows that survive to `keep` until it is full."""
+    kept = 0
+    for candidate in range(boxes.shape[0]):
+        if kept == keep.size:
+            break
+        survives = True
+        for k in range(kept):
+            if bev_iou(boxes[keep[k]], boxes[candidate]) > threshold:
+                survives = False
+                break
+        if survives:
+            keep[kept] = candidate
+            kept += 1
+    return kept
+
+
+@kernel
+def keep_aligned(boxes: Array, threshold: float, keep: Any) -> int:
+    """As `keep_rotated` with unrotated rectangles."""
+    kept = 0
+    for candidate in range(boxes.shape[0]):
+        if kept == keep.size:
+            break
+        survives = True
+        for k in range(kept):
+            if _aligned_iou(boxes[keep[k]], boxes[candidate]) > threshold:
+                survives = False
+                break
+        if survives:
+            keep[kept] = candidate
+            kept += 1
+    return kept
+
+
 def checked_boxes(boxes: Any, name: str) -> Array:
     """`boxes` as C-contiguous (N, 7) float64; an empty list counts as (0, 7). Raises ValueError otherwise."""
     values = np.ascontiguousarray(boxes, dtype=np.float64)

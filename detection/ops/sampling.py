@@ -27,12 +27,14 @@ def furthest_point_sample(xyz: Tensor, npoint: int) -> Tensor:
     if points.device.type != "cpu":
         return unbatched(_torch_points.furthest_point_sample(points, npoint), single)
 
-    from detection.ops._fps_kernel import sample
+    from detection.ops import _bucket_kernels
     from detection.ops._numba import for_ranges
 
     samples = torch.empty(points.shape[0], npoint, dtype=torch.int64)
     source, target = points.numpy(), samples.numpy()
-    for_ranges(
-        lambda start, stop: sample(source[start:stop], target[start:stop]), len(source), torch.get_num_threads(), 1
-    )
+
+    def sample(i: int, j: int) -> None:
+        _bucket_kernels.furthest_point_sample(source[i:j], target[i:j])
+
+    for_ranges(sample, len(source), torch.get_num_threads(), 1)
     return unbatched(samples, single)
