@@ -86,9 +86,9 @@ class BinCoder:
     def encode_location(self, offset: Tensor) -> tuple[Tensor, Tensor]:
         """Offset in metres -> (bin, residual in bins)."""
         shifted = (offset + self.scope).clamp(0, 2 * self.scope - 1e-3)
-        index = (shifted / self.bin_size).floor().long()
+        index = (shifted / self.bin_size).floor()
         residual = (shifted - (index * self.bin_size + self.bin_size / 2)) / self.bin_size
-        return index, residual
+        return index.long(), residual
 
     def encode_heading(self, ry: Tensor) -> tuple[Tensor, Tensor]:
         """Heading in radians (relative to the proposal when folded) -> (bin, residual in half bins)."""
@@ -101,8 +101,8 @@ class BinCoder:
             shifted = shifted.clamp(1e-3, math.pi / 2 - 1e-3)
         else:
             shifted = (angle + size / 2).remainder(2 * math.pi)
-        index = (shifted / size).floor().long().clamp(max=self.heading_bins - 1)
-        return index, (shifted - (index * size + size / 2)) / (size / 2)
+        index = (shifted / size).floor().clamp(max=self.heading_bins - 1)
+        return index.long(), (shifted - (index * size + size / 2)) / (size / 2)
 
     def encode(self, offsets: Tensor, sizes: Tensor, ry: Tensor, mean_sizes: Tensor) -> BinTargets:
         """Targets of R boxes.
@@ -143,7 +143,7 @@ class BinCoder:
     def best_location(self, logits: Tensor, residuals: Tensor) -> Tensor:
         """Hard decoding (PointRCNN): centre of the best bin plus its residual, metres. (..., n) -> (...)."""
         best = logits.argmax(dim=-1, keepdim=True)
-        location = best.squeeze(-1) * self.bin_size + self.bin_size / 2 - self.scope
+        location = self.bin_centres(logits)[best.squeeze(-1)]
         if self.fine_location:
             location = location + residuals.gather(-1, best).squeeze(-1) * self.bin_size
         return location
@@ -153,7 +153,7 @@ class BinCoder:
         best = logits.argmax(dim=-1, keepdim=True)
         size = self.heading_bin_size
         offset = residuals.gather(-1, best).squeeze(-1) * (size / 2)
-        best = best.squeeze(-1)
+        best = best.squeeze(-1).to(residuals.dtype)
         if self.folded_heading:
             return best * size + size / 2 + offset - math.pi / 4
         ry = (best * size + offset).remainder(2 * math.pi)

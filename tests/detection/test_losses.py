@@ -1,0 +1,125 @@
+"""Losses by hand and against the twin in plain Python."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from detection.losses import (
+    bin_box_loss,
+    box_corners,
+    consistency_loss,
+    corner_loss,
+    foreground_loss,
+    masked_bce,
+    sigmoid_focal,
+    smooth_l1,
+)
+from detection.models.box_coding import MEAN_SIZES, rcnn_coder, rpn_coder
+from tests.reference import detection_losses as twin
+
+CAR = torch.tensor(MEAN_SIZES["Car"], dtype=torch.float64)
+
+
+def test_focal_loss_by_hand() -> None:
+    # p = 0.5: 0.25 * 0.25 * ln 2 for a positive, 0.75 * 0.25 * ln 2 for a negative.
+    loss = sigmoid_focal(torch.zeros(2, dtype=torch.float64), torch.tensor([1.0, 0.0], dtype=torch.float64))
+    assert loss.tolist() == pytest.approx([0.0625 * math.log(2), 0.1875 * math.log(2)])
+
+
+def test_foreground_loss_ignores_the_ring_and_divides_by_positives() -> None:
+    logits = torch.zeros(1, 5, 1, dtype=torch.float64)
+    loss = foreground_loss(logits, torch.tensor([[1, 1, 0, -1, -1]]))
+    assert loss.item() == pytest.approx((2 * 0.0625 + 0.1875) * math.log(2) / 2)
+    assert foreground_loss(logits, torch.tensor([[0, 0, -1, -1, -1]])).item() == pytest.approx(2 * 0.1875 * math.log(2))
+
+
+def test_foreground_loss_of_several_classes() -> None:
+    # A point of class 2 is a negative for class 1.
+    loss = foreground_loss(torch.zeros(1, 1, 2, dtype=torch.float64), torch.tensor([[2]]))
+    assert loss.item() == pytest.approx((0.0625 + 0.1875) * math.log(2))
+
+
+@pytest.mark.parametrize(
+    ("coder", "scope", "heading", "folded"), [(rpn_coder(), 3.0, 12, False), (rcnn_coder(), 1.5, 9, True)]
+)
+def test_box_and_consistency_losses_agree_with_the_twin(coder, scope, heading, folded, rng) -> None:
+    codes = rng.normal(0, 0.7, (20, coder.channels))
+    boxes = np.column_stack([rng.uniform(-1.7, 1.7, (20, 3)), rng.uniform(1, 5, (20, 3)), rng.uniform(-4, 4, 20)])
+    logits = rng.normal(0, 2, 20)
+    code, box = torch.tensor(codes), torch.tensor(boxes)
+    targets = coder.encode(box[:, :3], box[:, 3:6], box[:, 6], CAR)
+    expected = np.mean([twin.box_loss(list(c), list(b), scope, heading, folded) for c, b in zip(codes, boxes)])
+    assert bin_box_loss(code, targets, coder).total().item() == pytest.approx(expected, rel=1e-9)
+    ours = consistency_loss(torch.tensor(logits), code, targets, box[:, 3:6], CAR, coder)
+    rows = zip(logits, codes, boxes)
+    expected = np.mean([twin.consistency(logit, list(c), list(b), scope, heading) for logit, c, b in rows])
+    assert ours.item() == pytest.approx(expected, rel=1e-9)
+
+
+def test_only_the_target_bin_of_a_residual_learns() -> None:
+    coder = rpn_coder()
+    code = torch.zeros(1, 76, dtype=torch.float64, requires_grad=True)
+    box = torch.tensor([[0.6, 0.0, -1.1, 1.5, 1.6, 4.0, 0.4]], dtype=torch.float64)
+    bin_box_loss(code, coder.encode(box[:, :3], box[:, 3:6], box[:, 6], CAR), coder).total().backward()
+    assert code.grad is not None
+    assert torch.nonzero(code.grad[0, 24:48]).flatten().tolist() == [7, 12 + 3]
+    assert torch.nonzero(code.grad[0, 61:73]).flatten().tolist() == [1]
+
+
+def test_consistency_gradient_reaches_score_centre_and_size() -> None:
+    coder = rpn_coder()
+    generator = torch.Generator().manual_seed(1)
+    code = (torch.randn(3, 76, generator=generator, dtype=torch.float64) * 0.1).requires_grad_()
+    logits = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    box = torch.tensor([[0.4, 0.1, -0.3, 1.4, 1.5, 4.2, 0.4]], dtype=torch.float64).repeat(3, 1)
+    targets = coder.encode(box[:, :3], box[:, 3:6], box[:, 6], CAR)
+    consistency_loss(logits, code, targets, box[:, 3:6], CAR, coder).backward()
+    assert code.grad is not None
+    assert logits.grad is not None
+    assert bool((logits.grad != 0).all())
+    for block, touched in zip(coder.split(code.grad), (True, True, True, True, True, False, False, True)):
+        assert bool((block != 0).any()) is touched
+
+
+def test_losses_without_foreground_are_zero_and_differentiable() -> None:
+    coder = rcnn_coder()
+    code = torch.zeros(0, 46, requires_grad=True)
+    empty = torch.zeros(0, 3)
+    targets = coder.encode(empty, empty, torch.zeros(0), CAR.float())
+    total = bin_box_loss(code, targets, coder).total()
+    total = total + consistency_loss(torch.zeros(0), code, targets, empty, CAR.float(), coder)
+    total.backward()
+    assert total.item() == 0
+
+
+def test_masked_bce_leaves_ignored_labels_out() -> None:
+    logits = torch.tensor([0.0, 100.0, 0.0], dtype=torch.float64)
+    assert masked_bce(logits, torch.tensor([1.0, -1.0, 0.0])).item() == pytest.approx(math.log(2))
+    assert masked_bce(logits, torch.tensor([-1.0, -1.0, -1.0])).item() == 0
+
+
+def test_smooth_l1_by_hand() -> None:
+    # Below beta 1/9: 4.5 x^2; above: |x| - 1/18.
+    loss = smooth_l1(torch.tensor([0.1, -0.5], dtype=torch.float64))
+    assert loss.tolist() == pytest.approx([0.045, 0.5 - 1 / 18])
+
+
+def test_corner_loss_sees_a_half_turn_as_no_error() -> None:
+    box = torch.tensor([[2.0, 1.0, 15.0, 1.5, 1.6, 4.0, 0.3]], dtype=torch.float64)
+    turned, lifted = box.clone(), box.clone()
+    turned[:, 6] += math.pi
+    lifted[:, 1] -= 0.5
+    assert corner_loss(turned, box).item() == pytest.approx(0, abs=1e-12)
+    assert corner_loss(lifted, box).item() == pytest.approx(0.125)
+
+
+def test_corners_match_the_devkit_order() -> None:
+    from detection.boxes import corners
+    from detection.types import Boxes3D
+
+    box = np.array([[2.0, 1.0, 15.0, 1.5, 1.6, 4.0, 0.3]])
+    np.testing.assert_allclose(box_corners(torch.tensor(box)).numpy(), corners(Boxes3D(box)), atol=1e-12)
