@@ -22,6 +22,10 @@ Float = NDArray[np.float32]
 _BUCKET = 32  # points
 _FANOUT = 16  # buckets in a block, blocks in a group
 _MORTON_BITS = 10  # per axis
+# Times a power of two, this de Bruijn number shows another pattern in its top six bits for each of the 64.
+_DE_BRUIJN = np.uint64(0x03F79D71B4CB0A89)
+_BIT_OF = np.zeros(64, np.int64)
+_BIT_OF[[((0x03F79D71B4CB0A89 << bit) % (1 << 64)) >> 58 for bit in range(64)]] = np.arange(64)
 _FARTHEST = np.float32(1e10)  # where the running squared distances of sampling start, as in the reference kernel
 
 
@@ -224,18 +228,20 @@ def furthest_point_sample(xyz: Float, out: NDArray[np.int64]) -> None:
 
 
 @kernel
-def _keep_lowest(kept: Any, count: int, index: int) -> int:
-    """Insert `index` into the ascending list kept[:count], dropping the largest when full; returns the new count."""
-    if count == kept.size:
-        if index >= kept[count - 1]:
-            return count
-        count -= 1
-    slot = count
-    while slot > 0 and kept[slot - 1] > index:
-        kept[slot] = kept[slot - 1]
-        slot -= 1
-    kept[slot] = index
-    return count + 1
+def _lowest_bits(words: Any, kept: Any) -> int:
+    """Positions of the lowest bits set in words (W,) uint64, ascending, into `kept` until full; clears all words."""
+    count = 0
+    for k in range(words.size):
+        word = words[k]
+        while word != 0 and count < kept.size:
+            lowest = word & (~word + np.uint64(1))
+            kept[count] = 64 * k + _BIT_OF[(lowest * _DE_BRUIJN) >> np.uint64(58)]
+            count += 1
+            word ^= lowest
+        if count == kept.size:
+            break
+    words[:] = 0
+    return count
 
 
 @kernel
@@ -263,13 +269,9 @@ def _mark_within(boxes: Float, node: int, point: Float, limit: Any, near: Any) -
 
 
 @kernel
-def _lowest_within(tree: Any, centre: Float, limit: Any, near: Any, kept: Any) -> int:
-    """Fill `kept` with the lowest indices of points with squared distance <= limit, ascending; returns how many.
-
-    near (3, 32) uint8 is working space.
-    """
+def _mark_hits(tree: Any, centre: Float, limit: Any, near: Any, hits: Any) -> None:
+    """Set the bit of every point with squared distance <= limit in hits (W,) uint64; near (3, 32) is working space."""
     points, owner, boxes, groups = tree
-    count = 0
     for group in range(groups.shape[0]):
         _mark_within(groups, group, centre, limit, near[0])
         for group_lane in range(_FANOUT):
@@ -282,8 +284,8 @@ def _lowest_within(tree: Any, centre: Float, limit: Any, near: Any, kept: Any) -
                 if near[1, lane] and _mark_points(points, bucket, centre, limit, near[2]):
                     for slot in range(_BUCKET):
                         if near[2, slot]:
-                            count = _keep_lowest(kept, count, owner[bucket, slot])
-    return count
+                            index = np.uint64(owner[bucket, slot])
+                            hits[index >> np.uint64(6)] |= np.uint64(1) << (index & np.uint64(63))
 
 
 @kernel
@@ -294,13 +296,14 @@ def ball_query(xyz: Float, centres: Float, radius2: Any, out: Any) -> None:
     """
     # "Below the radius" is "at most the float32 number before it".
     limit = np.nextafter(radius2, np.float32(0))
-    kept, near = np.empty(out.shape[2], np.int64), np.empty((3, _BUCKET), np.uint8)
+    near = np.empty((3, _BUCKET), np.uint8)
+    hits = np.zeros((xyz.shape[1] + 63) // 64, np.uint64)
     for batch in range(xyz.shape[0]):
         tree = _build(xyz[batch], radius2)
         for p in range(centres.shape[1]):
-            count = _lowest_within(tree, centres[batch, p], limit, near, kept)
-            out[batch, p, :count] = kept[:count]
-            out[batch, p, count:] = kept[0] if count else 0
+            _mark_hits(tree, centres[batch, p], limit, near, hits)
+            count = _lowest_bits(hits, out[batch, p])
+            out[batch, p, count:] = out[batch, p, 0] if count else 0
 
 
 @kernel
