@@ -55,7 +55,7 @@ def test_a_missing_or_foreign_card_is_refused(saved: Path) -> None:
     with pytest.raises(CheckpointError, match="not a card"):
         load_checkpoint(saved)
     card.unlink()
-    with pytest.raises(CheckpointError, match="card net.json is missing"):
+    with pytest.raises(CheckpointError, match=r"card net\.json is missing"):
         load_checkpoint(saved)
 
 

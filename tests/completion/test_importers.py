@@ -131,7 +131,7 @@ def test_a_file_that_calls_something_is_refused_and_nothing_runs(tmp_path: Path,
 @FORMATS
 def test_a_whole_pickled_module_is_refused(tmp_path: Path, zipped: bool) -> None:
     path = save(tmp_path / "final_model.pth", build_model(default_spec("msg_chn", channels=2)), zipped)
-    with pytest.raises(CheckpointError, match="refused|cannot be imported"):
+    with pytest.raises(CheckpointError, match=r"refused|cannot be imported"):
         import_checkpoint(path, "msg_chn")
 
 
@@ -158,7 +158,7 @@ def test_the_same_size_variant_is_told_apart(tmp_path: Path) -> None:
 
 def test_no_pytorch_file(tmp_path: Path) -> None:
     (tmp_path / "text.pth").write_bytes(b"no checkpoint" * 40)
-    with pytest.raises(CheckpointError, match="not a readable PyTorch file|refused"):
+    with pytest.raises(CheckpointError, match=r"not a readable PyTorch file|refused"):
         import_checkpoint(tmp_path / "text.pth", "twise")
     with pytest.raises(ValueError, match="architecture"):
         import_checkpoint(tmp_path / "text.pth", "nlspn")
