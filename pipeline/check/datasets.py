@@ -32,6 +32,7 @@ class Comparison:
     layout: str
     root: str
     present: dict[str, frozenset[str]] = field(default_factory=dict)
+    declared: dict[str, frozenset[str]] = field(default_factory=dict)
     digests: dict[str, dict[bytes, str]] = field(default_factory=dict)
     repeated: dict[tuple[str, str], set[str]] = field(default_factory=dict)
     hashed: dict[str, int] = field(default_factory=dict)
@@ -45,6 +46,7 @@ class Comparison:
     def add(self, facts: FrameFacts) -> None:
         """Takes the numbers of one frame, in the order of the frames."""
         self.present[facts.frame] = facts.present & frozenset(_EXPECTED)
+        self.declared[facts.frame] = facts.declared & frozenset(_EXPECTED)
         self.hashed[facts.frame] = len(facts.hashes)
         for part, digest in facts.hashes:
             first = self.digests.setdefault(part, {}).setdefault(digest, facts.frame)
@@ -88,10 +90,11 @@ class Comparison:
         counts = Counter(part for parts in self.present.values() for part in parts)
         expected = {part for part, count in counts.items() if 2 * count > len(self.present)}
         for frame, parts in self.present.items():
-            lacking = sorted(expected - parts)
+            wanted = expected | self.declared[frame]
+            lacking = sorted(wanted - parts)
             if not lacking:
                 continue
-            alone = len(expected) > 2 and len(parts & expected) <= 1
+            alone = len(wanted) > 2 and len(self.present) > 1 and len(parts & wanted) <= 1
             fault = "extra_file" if alone else "missing_file"
             message = f"only {', '.join(sorted(parts)) or 'other files'}" if alone else f"no {', '.join(lacking)}"
             yield Finding(fault, frame, self.root, f"{message}; {len(self.present)} frames in all")

@@ -28,7 +28,7 @@ def read_objects(path: Path, frame: str, scored: bool) -> tuple[list[KittiObject
     except UnicodeDecodeError:
         return [], [Finding("malformed_labels", frame, str(path), "bytes that are not UTF-8 text")]
     columns = {len(line.split()) for line in text.splitlines() if line.strip()}
-    if columns == ({15} if scored else {16}):
+    if (15 if scored else 16) in columns and columns <= {15, 16}:
         what = "15 columns in a folder of results" if scored else "16 columns (with scores) in a folder of labels"
         return [], [Finding("label_result_mixup", frame, str(path), what)]
     try:
