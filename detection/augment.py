@@ -199,7 +199,7 @@ def augment_regions(
     def moved(boxes: Tensor) -> Tensor:
         centre = rotate_y(boxes[..., :3], angle) * scale.unsqueeze(-1)
         ry = boxes[..., 6] + angle
-        mirrored = torch.where(ry >= 0, math.pi, -math.pi) - ry
+        mirrored = torch.full_like(ry, math.pi).copysign(ry) - ry
         x = torch.where(flip, -centre[..., 0], centre[..., 0])
         heading = torch.where(flip, mirrored, ry)
         sizes = boxes[..., 3:6] * scale.unsqueeze(-1)
