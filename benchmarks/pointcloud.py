@@ -4,7 +4,7 @@
     OMP_NUM_THREADS=2 taskset -c 0,1 python -m benchmarks.pointcloud
 
 The same four steps on the same frame, alternating in one process. Peers get float32 arithmetic, precomputed rays, and
-as many SciPy and Open3D threads as there are cores; ours uses one thread. "equal" means the same points in the same order
+as many SciPy and Open3D threads as there are cores; ours uses one thread. "equal": the same points in the same order
 (first), up to ties (nearest); Open3D anchors its grid at the cloud's corner, so its centroids cannot be compared.
 """
 

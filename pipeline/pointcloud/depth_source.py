@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from completion.types import CompletedDepth
+from pipeline.data.depth_png import read_depth_png
 from pipeline.errors import DataError
 from pipeline.pointcloud.pseudo_sigma import pseudo_sigma
 
@@ -21,21 +21,10 @@ def read_depth_folder(folder: str | Path, frame_id: str, image_size: tuple[int, 
 
     Raises DataError when the file is missing, is not a uint16 PNG, or is larger than the image.
     """
-    depth = read_uint16_depth(Path(folder) / f"{frame_id}.png")
+    depth = read_depth_png(Path(folder) / f"{frame_id}.png")
     if image_size is not None and depth.shape != tuple(image_size):
         depth = placed_bottom_centre(depth, image_size, Path(folder) / f"{frame_id}.png")
     return pseudo_sigma(depth)
-
-
-def read_uint16_depth(path: Path) -> NDArray[np.float32]:
-    """(H, W) float32 metres of a KITTI depth PNG."""
-    if not path.is_file():
-        raise DataError(path, "a depth PNG named after the frame", "no such file", "see --depth-from")
-    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if stored is None or stored.ndim != 2 or stored.dtype != np.uint16:
-        found = "a file that is no image" if stored is None else f"{stored.dtype} of shape {stored.shape}"
-        raise DataError(path, "a one-channel uint16 PNG (metres x 256)", found, "was it saved again by a viewer?")
-    return np.asarray(stored.astype(np.float32) / np.float32(256))
 
 
 def placed_bottom_centre(

@@ -69,10 +69,10 @@ def test_folder_of_pngs(tmp_path: Path) -> None:
 
 
 def test_folder_refuses_missing_and_wrong_files(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no such file"):
+    with pytest.raises(DataError, match="000001"):
         read_depth_folder(tmp_path, "000001")
     cv2.imwrite(str(tmp_path / "000001.png"), np.zeros((4, 6), np.uint8))
-    with pytest.raises(DataError, match="uint16 PNG"):
+    with pytest.raises(DataError, match="uint16"):
         read_depth_folder(tmp_path, "000001")
     cv2.imwrite(str(tmp_path / "000002.png"), np.zeros((4, 6), np.uint16))
     with pytest.raises(DataError, match="at most 3 x 3"):
