@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import pickle
 import re
+import warnings
 from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -48,11 +49,21 @@ def _nothing(*args: Any) -> None:
     return None
 
 
+class _Dtype:
+    """In place of numpy.dtype, which such scalars name."""
+
+    def __init__(self, *args: Any) -> None: ...
+
+    def __setstate__(self, state: Any) -> None:
+        return None
+
+
 _CONTAINERS: list[Any] = [
     OrderedDict,
     (defaultdict, "collections.defaultdict"),
     (_nothing, "numpy.core.multiarray.scalar"),
     (_nothing, "numpy._core.multiarray.scalar"),
+    (_Dtype, "numpy.dtype"),
 ]
 
 
@@ -62,18 +73,26 @@ def read_pickle(path: str | Path) -> Any:
     seen: set[str] = set()
     while len(seen) < _MOST_CLASSES:
         try:
-            with torch.serialization.safe_globals(allowed):
+            with torch.serialization.safe_globals(allowed), warnings.catch_warnings():
+                # A file of an unusual pickle protocol is still read, or refused below.
+                warnings.filterwarnings("ignore", message="Detected pickle protocol")
                 return torch.load(path, map_location="cpu", weights_only=True)
         except pickle.UnpicklingError as error:
             named = _NOT_ALLOWED.search(str(error))
             if named is None or named.group(1) in seen:
-                reason = str(error).split(". ")[-1].split("\n")[0][:200]
-                raise ValueError(f"{path}: refused, nothing in it was executed: {reason}") from error
+                raise ValueError(f"{path}: refused, nothing in it was executed: {_reason(error)}") from error
             seen.add(named.group(1))
             allowed.append((_stand_in(named.group(1)), named.group(1)))
-        except (RuntimeError, EOFError, KeyError, AttributeError, TypeError, IndexError) as error:
+        except (RuntimeError, ValueError, EOFError, KeyError, AttributeError, TypeError, IndexError) as error:
             raise ValueError(f"{path}: expected a PyTorch checkpoint, cannot read it: {error}") from error
     raise ValueError(f"{path}: refused: it mentions more than {_MOST_CLASSES} classes")
+
+
+def _reason(error: Exception) -> str:
+    """The sentence of torch's long message that names the culprit."""
+    sentences = [part.strip() for part in re.split(r"\n|\. ", str(error))]
+    telling = [part for part in sentences if re.search(r"calls|GLOBAL|REDUCE|blocked|NEWOBJ|BUILD|persistent", part)]
+    return (telling or sentences)[0][:300]
 
 
 def read_tensors(path: str | Path) -> dict[str, Tensor]:
