@@ -112,8 +112,10 @@ def vary(rng: np.random.Generator, colour: Colour, amount: float = 0.15) -> Colo
     return float(red), float(green), float(blue)
 
 
-GLASS_CAR = Surface(Texture.GLASS, (0.012, 0.014, 0.015), CAR, 0.06, transmission=0.85, gloss=0.85, smooth=True)
-PANE = Surface(Texture.GLASS, (0.02, 0.024, 0.028), BUILDING, 0.10, dropout=0.55, gloss=0.7)
+GLASS_CAR = Surface(
+    Texture.GLASS, (0.012, 0.014, 0.015), CAR, 0.06, transmission=0.45, dropout=0.75, gloss=0.85, smooth=True
+)
+PANE = Surface(Texture.GLASS, (0.02, 0.024, 0.028), BUILDING, 0.10, dropout=0.3, gloss=0.7)
 TYRE = Surface(Texture.PLAIN, (0.012, 0.012, 0.012), CAR, 0.05, dropout=0.15)
 RIM = Surface(Texture.PLAIN, (0.28, 0.28, 0.29), CAR, 0.35, gloss=0.25)
 PLASTIC_DARK = Surface(Texture.PLAIN, (0.018, 0.018, 0.02), CAR, 0.08)

@@ -26,7 +26,7 @@ def foliage(rng: np.random.Generator) -> Surface:
 
 
 def _core(leaves: Surface) -> Surface:
-    dark = tuple(0.35 * channel for channel in leaves.colour)
+    dark = tuple(0.6 * channel for channel in leaves.colour)
     return Surface(Texture.LEAVES, (dark[0], dark[1], dark[2]), S.VEGETATION, 0.35, second=leaves.colour, scale=0.18)
 
 
@@ -41,7 +41,7 @@ def _blob(
     """Leaf cards in an ellipsoid, most of them near its skin."""
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    reach = 1 - 0.45 * rng.random(count) ** 2
+    reach = 1 - 0.6 * rng.random(count) ** 1.5
     sizes = size * rng.uniform(0.6, 1.4, count)
     return cards(centre + direction * radii * reach[:, None], sizes, rng, leaves)
 
@@ -68,9 +68,9 @@ def build_tree(rng: np.random.Generator, detail: float) -> list[Part]:
         level = stem + (height - stem) * rng.uniform(0.2, 0.75)
         centre = np.array([out * np.cos(angle) + lean[0], out * np.sin(angle) + lean[1], level])
         radii = np.array([1, 1, 0.75]) * spread * rng.uniform(0.45, 0.8)
-        count = int(1000 * detail) + 25
+        count = int(1700 * detail) + 25
         parts.append(_blob(centre, radii, count, 0.18 / np.sqrt(max(detail, 0.08)), rng, leaves))
-        parts.append(ellipsoid(radii * 0.5, centre, _core(leaves), 6, 8))
+        parts.append(ellipsoid(radii * 0.42, centre, _core(leaves), 6, 8))
         if detail > 0.3:
             branch = np.stack([path[1], 0.5 * (path[1] + centre) + (0, 0, 0.1), centre])
             parts.append(tube(branch, girth * np.array([0.45, 0.3, 0.12]), 5, S.BARK))
