@@ -1,7 +1,8 @@
-"""Completed depth from any published method: a folder of uint16 PNGs, one per frame."""
+"""Completed depth from files: an earlier run of ours, or any published method as a folder of uint16 PNGs."""
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,30 @@ def read_depth_folder(folder: str | Path, frame_id: str, image_size: tuple[int, 
     if image_size is not None and depth.shape != tuple(image_size):
         depth = placed_bottom_centre(depth, image_size, Path(folder) / f"{frame_id}.png")
     return pseudo_sigma(depth)
+
+
+def read_completed(folder: str | Path, frame_id: str, image_size: tuple[int, int] | None = None) -> CompletedDepth:
+    """The completed depth of one frame from a run folder or a folder of PNGs.
+
+    A run has depth/ID.png and, from a network with two surfaces, twin/ID.npz (foreground and background uint16 x 256,
+    sigma uint8 / 255). Otherwise as `read_depth_folder`.
+
+    Raises DataError when a file is missing or damaged.
+    """
+    run = Path(folder)
+    if not (run / "depth").is_dir():
+        return read_depth_folder(run, frame_id, image_size)
+    twin = run / "twin" / f"{frame_id}.npz"
+    if not twin.is_file():
+        return read_depth_folder(run / "depth", frame_id, image_size)
+    depth = read_depth_png(run / "depth" / f"{frame_id}.png")
+    try:
+        with np.load(twin, allow_pickle=False) as parts:
+            foreground, background = (parts[name].astype(np.float32) / 256 for name in ("foreground", "background"))
+            sigma = parts["sigma"].astype(np.float32) / 255
+        return CompletedDepth(depth, foreground, background, sigma)
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise DataError(twin, "foreground, background and sigma maps of this frame", str(error)) from None
 
 
 def placed_bottom_centre(
