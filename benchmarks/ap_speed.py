@@ -3,8 +3,8 @@
     python -m benchmarks.ap_speed                 # 3769 frames, about 24 thousand detections
     python -m benchmarks.ap_speed --twin 100      # also the plain Python twin on the first 100 frames
 
-Prints seconds of one core for reading and for evaluating (2D, AOS, BEV, 3D; strict and loose; three classes and
-levels), for a fresh process with numba's cache, and the peak memory of that process.
+Prints CPU seconds of one core (other load on the machine does not count) for reading and for evaluating (2D, AOS, BEV,
+3D; strict and loose; three classes and levels), in a fresh process with numba's cache and again, and its peak memory.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ import numpy as np
 
 MEASURE = """
 import resource, sys, time
-start = time.perf_counter()
+start = time.process_time()
 from detection.evaluation.kitti_ap import evaluate, prepare
-imported = time.perf_counter()
+imported = time.process_time()
 evaluate(sys.argv[1], sys.argv[2])
-first = time.perf_counter()
+first = time.process_time()
 evaluation = prepare(sys.argv[1], sys.argv[2])
-read = time.perf_counter()
+read = time.process_time()
 report = evaluation.report()
-done = time.perf_counter()
+done = time.process_time()
 print(imported - start, first - imported, read - first, done - read,
       resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, report["protocol"]["detections"])
 """
@@ -83,11 +83,11 @@ def time_twin(labels: Path, detections: Path, frames: int) -> None:
     names = [f"{frame:06d}" for frame in range(frames)]
     sides = [[parse_lines((folder / f"{name}.txt").read_text()) for name in names] for folder in (labels, detections)]
     evaluate(*sides, classes=["Car"], metrics=["2d", "3d"], iou_set="strict")  # loads the compiled kernels
-    start = time.perf_counter()
+    start = time.process_time()
     twin = [average_precision(*sides, "Car", metric, 0.7, 1) for metric in ("2d", "3d")]
-    middle = time.perf_counter()
+    middle = time.process_time()
     rows = evaluate(*sides, classes=["Car"], metrics=["2d", "3d"], iou_set="strict")["results"]
-    end = time.perf_counter()
+    end = time.process_time()
     print(f"twin on {frames} frames  {middle - start:8.2f} s  AP {twin[0]:.4f} {twin[1]:.4f} (2 values)")
     ours = f"AP {rows[0]['moderate']:.4f} {rows[1]['moderate']:.4f} (and easy, hard)"
     print(f"ours on {frames} frames  {end - middle:8.2f} s  {ours}")
@@ -103,11 +103,9 @@ def main() -> None:
         one_core = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
         command = [sys.executable, "-c", MEASURE, str(labels), str(detections)]
         for _ in range(2):  # the first process compiles if need be, the second finds numba's cache
-            start = time.perf_counter()
             output = subprocess.run(command, env=one_core, check=True, capture_output=True, text=True).stdout.split()
-            whole = time.perf_counter() - start
         imports, first, read, rest, memory, count = map(float, output)
-        print(f"{arguments.frames} frames, {int(count)} detections; fresh process {whole:.2f} s with both evaluations")
+        print(f"{arguments.frames} frames, {int(count)} detections, CPU seconds of one core")
         print(f"import             {imports:6.2f} s")
         print(f"first evaluation   {first:6.2f} s (numba's cache on disk)")
         print(f"second: read       {read:6.2f} s")

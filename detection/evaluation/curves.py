@@ -73,7 +73,7 @@ def curve_of(records: MatchRecords) -> Curve:
     """The sampled curve over all frames, each counted once."""
     weights = np.ones(len(records.n_labels), dtype=np.int64)
     thresholds, counts = np.empty(SAMPLES), np.zeros((3, SAMPLES))
-    used = _weighted_counts(*_arrays(records), weights, thresholds, counts)
+    used = _weighted_counts(records, weights, thresholds, counts)
     tp, fp, similarity = (row[:used].copy() for row in counts)
     return Curve(int(records.n_labels.sum()), thresholds[:used].copy(), tp, fp, similarity)
 
@@ -103,20 +103,7 @@ def resampled_ap(records: MatchRecords, weights: Index, recall_points: int, *, o
     """
     if recall_points not in RECALL_POINTS:
         raise ValueError(f"recall points: expected 40 or 11, got {recall_points}")
-    return np.asarray(_resampled_ap(*_arrays(records), weights, recall_points, orientation))
-
-
-def _arrays(records: MatchRecords) -> tuple[Index, Array, Index, Array, Index, Index, Index, Array]:
-    return (
-        records.n_labels,
-        records.tp_score,
-        records.tp_frame,
-        records.score,
-        records.frame,
-        records.tp,
-        records.fp,
-        records.similarity,
-    )
+    return np.asarray(_resampled_ap(records, weights, recall_points, orientation))
 
 
 @kernel
@@ -143,58 +130,32 @@ def _choose_thresholds(n_labels: int, tp_score: Array, tp_frame: Index, weights:
 
 
 @kernel
-def _weighted_counts(
-    n_labels: Index,
-    tp_score: Array,
-    tp_frame: Index,
-    score: Array,
-    frame: Index,
-    tp: Index,
-    fp: Index,
-    similarity: Array,
-    weights: Index,
-    thresholds: Array,
-    counts: Array,
-) -> int:
+def _weighted_counts(records: MatchRecords, weights: Index, thresholds: Array, counts: Array) -> int:
     """Fill thresholds (41,) and counts (3, 41) of tp, fp, similarity; returns how many samples are used."""
-    total = 0
-    for f in range(len(n_labels)):
-        total += weights[f] * n_labels[f]
-    if total == 0:
+    n_labels = 0
+    for f in range(len(weights)):
+        n_labels += weights[f] * records.n_labels[f]
+    if n_labels == 0:
         return 0
-    used = _choose_thresholds(total, tp_score, tp_frame, weights, thresholds)
-    e, tp_sum, fp_sum, similarity_sum = 0, 0, 0, 0.0
+    used = _choose_thresholds(n_labels, records.tp_score, records.tp_frame, weights, thresholds)
+    e, tp, fp, similarity = 0, 0, 0, 0.0
     for k in range(used):
-        while e < len(score) and score[e] >= thresholds[k]:
-            weight = weights[frame[e]]
-            tp_sum += weight * tp[e]
-            fp_sum += weight * fp[e]
-            similarity_sum += weight * similarity[e]
+        while e < len(records.score) and records.score[e] >= thresholds[k]:
+            weight = weights[records.frame[e]]
+            tp += weight * records.tp[e]
+            fp += weight * records.fp[e]
+            similarity += weight * records.similarity[e]
             e += 1
-        counts[0, k], counts[1, k], counts[2, k] = tp_sum, fp_sum, similarity_sum
+        counts[0, k], counts[1, k], counts[2, k] = tp, fp, similarity
     return used
 
 
 @kernel
-def _resampled_ap(
-    n_labels: Index,
-    tp_score: Array,
-    tp_frame: Index,
-    score: Array,
-    frame: Index,
-    tp: Index,
-    fp: Index,
-    similarity: Array,
-    weights: Index,
-    recall_points: int,
-    orientation: bool,
-) -> Array:
+def _resampled_ap(records: MatchRecords, weights: Index, recall_points: int, orientation: bool) -> Array:
     thresholds, counts = np.empty(41), np.zeros((3, 41))
     values = np.zeros(len(weights))
     for b in range(len(weights)):
-        used = _weighted_counts(
-            n_labels, tp_score, tp_frame, score, frame, tp, fp, similarity, weights[b], thresholds, counts
-        )
+        used = _weighted_counts(records, weights[b], thresholds, counts)
         best, area = 0.0, 0.0
         for k in range(used - 1, -1, -1):
             found = counts[2, k] if orientation else counts[0, k]

@@ -81,8 +81,8 @@ class _Story:
     def of(cls, matcher: Matcher, target: Target, level: int) -> _Story:
         labels, detections = matcher.pair.labels, matcher.pair.detections
         overlaps = matcher.overlaps(target.overlap)
-        on_label, on_detection = matcher.flags(target, level)
-        match = match_all(overlaps, on_label, on_detection, detections.score, target.iou)
+        rivals = matcher.rivalry(target, level)
+        match = match_all(rivals)
         taken_by = np.full(len(detections), -1, dtype=np.int64)
         taken_by[match[match >= 0]] = np.flatnonzero(match >= 0)
         pairs: dict[int, list[tuple[int, float]]] = {}
@@ -93,8 +93,8 @@ class _Story:
             matcher,
             target,
             level,
-            on_label,
-            on_detection,
+            rivals.label_flag,
+            rivals.detection_flag,
             match,
             taken_by,
             pairs,
@@ -216,11 +216,10 @@ def orientation_errors(matcher: Matcher, target: Target, level: int) -> tuple[fl
     None when nothing matches.
     """
     labels, detections = matcher.pair.labels, matcher.pair.detections
-    on_label, on_detection = matcher.flags(target, level)
-    overlaps = matcher.overlaps(target.overlap)
-    match = match_all(overlaps, on_label, on_detection, detections.score, target.iou)
-    rows = np.flatnonzero((match >= 0) & (on_label == VALID))
-    rows = rows[on_detection[match[rows]] == VALID]
+    rivals = matcher.rivalry(target, level)
+    match = match_all(rivals)
+    rows = np.flatnonzero((match >= 0) & (rivals.label_flag == VALID))
+    rows = rows[rivals.detection_flag[match[rows]] == VALID]
     if len(rows) == 0:
         return None
     turn = labels.values[rows, ALPHA] - detections.values[match[rows], ALPHA]

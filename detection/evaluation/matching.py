@@ -11,7 +11,7 @@ each counted any number of times, is then a sum over events: this makes both AP 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,7 @@ VALID, IGNORED, INVISIBLE = 0, 1, -1
 _NO_DETECTION = -10000000.0
 
 
-@dataclass(frozen=True)
-class MatchRecords:
+class MatchRecords(NamedTuple):
     """Everything an AP value depends on, per frame.
 
     n_labels                          (F,) labels that count
@@ -48,34 +47,49 @@ class MatchRecords:
     similarity: Array
 
 
+class Rivalry(NamedTuple):
+    """What the matching looks at: who overlaps whom, who counts, and the scores (a tuple, as kernels take those).
+
+    start, detection, iou, dontcare  as in `Overlaps`
+    min_overlap                      a match needs an IoU strictly above it
+    label_flag, detection_flag       (G,), (D,) int8 flags
+    score                            (D,)
+    """
+
+    start: Index
+    detection: Index
+    iou: Array
+    dontcare: Array
+    min_overlap: float
+    label_flag: Flags
+    detection_flag: Flags
+    score: Array
+
+
+def rivalry(overlaps: Overlaps, min_overlap: float, flags: tuple[Flags, Flags], scores: Array) -> Rivalry:
+    """Overlaps, limit, flags of labels (G,) and detections (D,), and scores (D,) in one."""
+    pairs = (overlaps.start, overlaps.detection, overlaps.iou, overlaps.dontcare)
+    return Rivalry(*pairs, float(min_overlap), *flags, scores)
+
+
 def record_matches(
-    label_offsets: Index,
-    detection_offsets: Index,
-    overlaps: Overlaps,
-    label_flag: Flags,
-    detection_flag: Flags,
-    scores: Array,
-    alphas: tuple[Array, Array],
-    min_overlap: float,
+    label_offsets: Index, detection_offsets: Index, rivals: Rivalry, alphas: tuple[Array, Array]
 ) -> MatchRecords:
     """Run both passes on every frame.
 
-    label_flag, detection_flag  (G,), (D,) int8 flags
-    scores                      (D,)
-    alphas                      (G,) of labels and (D,) of detections, radians
-    min_overlap                 a match needs an IoU strictly above it
+    label_offsets, detection_offsets  (F + 1,) rows of each frame
+    alphas                            (G,) of labels and (D,) of detections, radians
     """
-    frames = np.repeat(np.arange(len(label_offsets) - 1), np.diff(label_offsets))
-    n_labels = np.bincount(frames[label_flag == VALID], minlength=len(label_offsets) - 1).astype(np.int64)
-    offsets_and_pairs = (label_offsets, detection_offsets, overlaps.start, overlaps.detection, overlaps.iou)
-    rows, tp_frame = _pass_a(*offsets_and_pairs, min_overlap, label_flag, detection_flag, scores)
-    score, frame, tp, fp, similarity = _pass_b_events(
-        *offsets_and_pairs, min_overlap, label_flag, detection_flag, scores, overlaps.dontcare, *alphas
-    )
-    by_score, by_event = np.argsort(-scores[rows], kind="stable"), np.argsort(-score, kind="stable")
+    n_frames = len(label_offsets) - 1
+    frames = np.repeat(np.arange(n_frames), np.diff(label_offsets))
+    n_labels = np.bincount(frames[rivals.label_flag == VALID], minlength=n_frames).astype(np.int64)
+    rows, tp_frame = _pass_a(label_offsets, rivals)
+    tp_score = rivals.score[rows]
+    score, frame, tp, fp, similarity = _pass_b_events(label_offsets, detection_offsets, rivals, *alphas)
+    by_score, by_event = np.argsort(-tp_score, kind="stable"), np.argsort(-score, kind="stable")
     return MatchRecords(
         n_labels,
-        scores[rows][by_score],
+        tp_score[by_score],
         tp_frame[by_score],
         score[by_event],
         frame[by_event],
@@ -85,98 +99,57 @@ def record_matches(
     )
 
 
-def match_all(
-    overlaps: Overlaps,
-    label_flag: Flags,
-    detection_flag: Flags,
-    scores: Array,
-    min_overlap: float,
-) -> Index:
+def match_all(rivals: Rivalry) -> Index:
     """(G,) the detection row each label gets in pass B when every detection is admitted, -1 for none."""
-    match = np.full(len(label_flag), -1, dtype=np.int64)
-    taken = np.zeros(len(detection_flag), dtype=np.bool_)
+    match = np.full(len(rivals.label_flag), -1, dtype=np.int64)
+    taken = np.zeros(len(rivals.score), dtype=np.bool_)
     # A pair lies within one frame, so the labels of all frames can be walked at once.
-    _match_at(
-        float(-np.finfo(np.float64).max),
-        0,
-        len(label_flag),
-        overlaps.start,
-        overlaps.detection,
-        overlaps.iou,
-        min_overlap,
-        label_flag,
-        detection_flag,
-        scores,
-        taken,
-        match,
-    )
+    _match_at(float(-np.finfo(np.float64).max), 0, len(match), rivals, taken, match)
     return match
 
 
 @kernel
-def _pass_a(
-    label_offsets: Index,
-    detection_offsets: Index,
-    start: Index,
-    pair_detection: Index,
-    pair_iou: Array,
-    min_overlap: float,
-    label_flag: Flags,
-    detection_flag: Flags,
-    scores: Array,
-) -> tuple[Index, Index]:
+def _pass_a(label_offsets: Index, r: Rivalry) -> tuple[Index, Index]:
     """Detection row and frame of every true positive when each label takes the highest score."""
-    taken = np.zeros(len(scores), dtype=np.bool_)
-    rows = np.empty(len(label_flag), dtype=np.int64)
-    frames = np.empty(len(label_flag), dtype=np.int64)
+    taken = np.zeros(len(r.score), dtype=np.bool_)
+    rows = np.empty(len(r.label_flag), dtype=np.int64)
+    frames = np.empty(len(r.label_flag), dtype=np.int64)
     count = 0
     for f in range(len(label_offsets) - 1):
         for g in range(label_offsets[f], label_offsets[f + 1]):
-            if label_flag[g] == INVISIBLE:
+            if r.label_flag[g] == INVISIBLE:
                 continue
             best, best_score = -1, _NO_DETECTION
-            for p in range(start[g], start[g + 1]):
-                d = pair_detection[p]
-                if detection_flag[d] == INVISIBLE or taken[d] or pair_iou[p] <= min_overlap:
+            for p in range(r.start[g], r.start[g + 1]):
+                d = r.detection[p]
+                if r.detection_flag[d] == INVISIBLE or taken[d] or r.iou[p] <= r.min_overlap:
                     continue
-                if scores[d] > best_score:
-                    best, best_score = d, scores[d]
+                if r.score[d] > best_score:
+                    best, best_score = d, r.score[d]
             if best >= 0:
                 taken[best] = True
-                if label_flag[g] == VALID and detection_flag[best] == VALID:
+                if r.label_flag[g] == VALID and r.detection_flag[best] == VALID:
                     rows[count], frames[count] = best, f
                     count += 1
     return rows[:count].copy(), frames[:count].copy()
 
 
 @kernel
-def _match_at(
-    threshold: float,
-    first: int,
-    last: int,
-    start: Index,
-    pair_detection: Index,
-    pair_iou: Array,
-    min_overlap: float,
-    label_flag: Flags,
-    detection_flag: Flags,
-    scores: Array,
-    taken: NDArray[np.bool_],
-    match: Index,
-) -> None:
+def _match_at(threshold: float, first: int, last: int, r: Rivalry, taken: NDArray[np.bool_], match: Index) -> None:
     """Pass B for labels first to last - 1 with detections of at least `threshold`; fills `taken` and `match`."""
     for g in range(first, last):
         match[g] = -1
-        if label_flag[g] == INVISIBLE:
+        if r.label_flag[g] == INVISIBLE:
             continue
         best, best_iou, best_is_ignored = -1, 0.0, False
-        for p in range(start[g], start[g + 1]):
-            d = pair_detection[p]
-            if detection_flag[d] == INVISIBLE or taken[d] or scores[d] < threshold or pair_iou[p] <= min_overlap:
+        for p in range(r.start[g], r.start[g + 1]):
+            d = r.detection[p]
+            flag, iou = r.detection_flag[d], r.iou[p]
+            if flag == INVISIBLE or taken[d] or r.score[d] < threshold or iou <= r.min_overlap:
                 continue
-            if detection_flag[d] == VALID and (pair_iou[p] > best_iou or best_is_ignored):
-                best, best_iou, best_is_ignored = d, pair_iou[p], False
-            elif detection_flag[d] == IGNORED and best < 0:
+            if flag == VALID and (iou > best_iou or best_is_ignored):
+                best, best_iou, best_is_ignored = d, iou, False
+            elif flag == IGNORED and best < 0:
                 best, best_is_ignored = d, True
         if best >= 0:
             match[g] = best
@@ -184,82 +157,71 @@ def _match_at(
 
 
 @kernel
+def _mark_contested(first: int, last: int, r: Rivalry, contested: NDArray[np.bool_]) -> None:
+    """Mark the detections that some label of first to last - 1 could take."""
+    for g in range(first, last):
+        if r.label_flag[g] == INVISIBLE:
+            continue
+        for p in range(r.start[g], r.start[g + 1]):
+            d = r.detection[p]
+            if r.detection_flag[d] != INVISIBLE and r.iou[p] > r.min_overlap:
+                contested[d] = True
+
+
+@kernel
+def _true_positives(
+    first: int, last: int, r: Rivalry, match: Index, label_alpha: Array, detection_alpha: Array
+) -> tuple[int, float]:
+    """Their number and orientation similarity after pass B."""
+    tp, similarity = 0, 0.0
+    for g in range(first, last):
+        d = match[g]
+        if d >= 0 and r.label_flag[g] == VALID and r.detection_flag[d] == VALID:
+            tp += 1
+            similarity += (1.0 + np.cos(label_alpha[g] - detection_alpha[d])) / 2.0
+    return tp, similarity
+
+
+@kernel
+def _is_stray(d: int, r: Rivalry) -> bool:
+    """Whether an unmatched detection is a false positive: it counts and no DontCare area absorbs it."""
+    return r.detection_flag[d] == VALID and r.dontcare[d] <= r.min_overlap
+
+
+@kernel
 def _pass_b_events(
-    label_offsets: Index,
-    detection_offsets: Index,
-    start: Index,
-    pair_detection: Index,
-    pair_iou: Array,
-    min_overlap: float,
-    label_flag: Flags,
-    detection_flag: Flags,
-    scores: Array,
-    dontcare: Array,
-    label_alpha: Array,
-    detection_alpha: Array,
+    label_offsets: Index, detection_offsets: Index, r: Rivalry, label_alpha: Array, detection_alpha: Array
 ) -> tuple[Array, Index, Index, Index, Array]:
     """Score, frame and changes of tp, fp and similarity wherever the outcome of pass B changes."""
-    n = len(scores)
-    event_score, event_similarity = np.empty(n, dtype=np.float64), np.empty(n, dtype=np.float64)
-    event_frame = np.empty(n, dtype=np.int64)
-    event_tp, event_fp = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
-    contested = np.zeros(n, dtype=np.bool_)
-    taken = np.zeros(n, dtype=np.bool_)
-    match = np.full(len(label_flag), -1, dtype=np.int64)
+    n = len(r.score)
+    score, frame, similarity = np.empty(n), np.empty(n, dtype=np.int64), np.empty(n)
+    tp, fp = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    contested, taken = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
+    match = np.full(len(r.label_flag), -1, dtype=np.int64)
     count = 0
     for f in range(len(label_offsets) - 1):
         first, last = label_offsets[f], label_offsets[f + 1]
         begin, end = detection_offsets[f], detection_offsets[f + 1]
-        for g in range(first, last):
-            if label_flag[g] == INVISIBLE:
-                continue
-            for p in range(start[g], start[g + 1]):
-                d = pair_detection[p]
-                if detection_flag[d] != INVISIBLE and pair_iou[p] > min_overlap:
-                    contested[d] = True
-        # Detections that no label can take are false positives from their score on, unless DontCare absorbs them.
+        _mark_contested(first, last, r, contested)
+        # Detections that no label can take are false positives from their score on.
         for d in range(begin, end):
-            if detection_flag[d] == VALID and not contested[d] and dontcare[d] <= min_overlap:
-                event_score[count], event_frame[count] = scores[d], f
-                event_tp[count], event_fp[count], event_similarity[count] = 0, 1, 0.0
+            if not contested[d] and _is_stray(d, r):
+                score[count], frame[count], similarity[count] = r.score[d], f, 0.0
+                tp[count], fp[count] = 0, 1
                 count += 1
         rivals = begin + np.nonzero(contested[begin:end])[0]
-        levels = np.unique(scores[rivals])
+        levels = np.unique(r.score[rivals])
         tp_before, fp_before, similarity_before = 0, 0, 0.0
         for k in range(len(levels) - 1, -1, -1):
             taken[begin:end] = False
-            _match_at(
-                levels[k],
-                first,
-                last,
-                start,
-                pair_detection,
-                pair_iou,
-                min_overlap,
-                label_flag,
-                detection_flag,
-                scores,
-                taken,
-                match,
-            )
-            tp, fp, similarity = 0, 0, 0.0
-            for g in range(first, last):
-                if match[g] >= 0 and label_flag[g] == VALID and detection_flag[match[g]] == VALID:
-                    tp += 1
-                    similarity += (1.0 + np.cos(label_alpha[g] - detection_alpha[match[g]])) / 2.0
+            _match_at(levels[k], first, last, r, taken, match)
+            tp_now, similarity_now = _true_positives(first, last, r, match, label_alpha, detection_alpha)
+            fp_now = 0
             for d in rivals:
-                active = detection_flag[d] == VALID and scores[d] >= levels[k]
-                if active and not taken[d] and dontcare[d] <= min_overlap:
-                    fp += 1
-            event_score[count], event_frame[count] = levels[k], f
-            event_tp[count], event_fp[count] = tp - tp_before, fp - fp_before
-            event_similarity[count] = similarity - similarity_before
+                if r.score[d] >= levels[k] and not taken[d] and _is_stray(d, r):
+                    fp_now += 1
+            score[count], frame[count], similarity[count] = levels[k], f, similarity_now - similarity_before
+            tp[count], fp[count] = tp_now - tp_before, fp_now - fp_before
             count += 1
-            tp_before, fp_before, similarity_before = tp, fp, similarity
-    return (
-        event_score[:count].copy(),
-        event_frame[:count].copy(),
-        event_tp[:count].copy(),
-        event_fp[:count].copy(),
-        event_similarity[:count].copy(),
-    )
+            tp_before, fp_before, similarity_before = tp_now, fp_now, similarity_now
+    return score[:count].copy(), frame[:count].copy(), tp[:count].copy(), fp[:count].copy(), similarity[:count].copy()

@@ -9,7 +9,16 @@ from functools import cached_property
 import numpy as np
 
 from detection.evaluation.difficulty import DifficultyRule, KittiDifficulty
-from detection.evaluation.matching import IGNORED, INVISIBLE, VALID, Flags, MatchRecords, record_matches
+from detection.evaluation.matching import (
+    IGNORED,
+    INVISIBLE,
+    VALID,
+    Flags,
+    MatchRecords,
+    Rivalry,
+    record_matches,
+    rivalry,
+)
 from detection.evaluation.objects import Mask, ObjectTable, X, Y, Z
 from detection.evaluation.overlaps import Overlaps, overlaps_of
 from detection.evaluation.reading import FramePair
@@ -197,15 +206,13 @@ class Matcher:
     def records(self, target: Target, level: int) -> MatchRecords:
         """Both matching passes over all frames."""
         labels, detections = self.pair.labels, self.pair.detections
-        return record_matches(
-            labels.offsets,
-            detections.offsets,
-            self.overlaps(target.overlap),
-            *self.flags(target, level),
-            detections.score,
-            (labels.alpha, detections.alpha),
-            target.iou,
-        )
+        alphas = (labels.alpha, detections.alpha)
+        return record_matches(labels.offsets, detections.offsets, self.rivalry(target, level), alphas)
+
+    def rivalry(self, target: Target, level: int) -> Rivalry:
+        """Overlaps, flags and scores of one target and level, as the matching takes them."""
+        flags = self.flags(target, level)
+        return rivalry(self.overlaps(target.overlap), target.iou, flags, self.pair.detections.score)
 
     def is_evaluated(self, target: Target) -> bool:
         """Whether the reference gives a value: the class is detected at least once, and for AOS with orientation."""

@@ -296,6 +296,26 @@ def test_range_bounds_belong_to_the_upper_bin() -> None:
     assert [row["range"] for row in rows["results"]] == [[0, 30], [30, 70], [0, None]]
 
 
+@pytest.mark.parametrize("flavor", ["cpp", "python"])
+@pytest.mark.parametrize("bounds", [(0, 14), (12, 16)])
+def test_a_range_equals_files_filtered_beforehand(bounds: tuple[float, float], flavor: str) -> None:
+    labels, detections = random_frames(21, frames=40)
+    inside = [[bounds[0] <= d.location[2] < bounds[1] for d in items] for items in detections]
+    kept = [[d for d, keep in zip(items, row) if keep] for items, row in zip(detections, inside)]
+    # Occlusion 3 is beyond every level: such a label is ignored, while neighbours and areas stay what they are.
+    hidden = [
+        [g if g.type == "DontCare" or bounds[0] <= g.location[2] < bounds[1] else replace(g, occluded=3) for g in items]
+        for items in labels
+    ]
+    filtered = evaluate(hidden, kept, flavor=flavor)["results"]
+    compared = 0
+    for row, other in zip(evaluate(labels, detections, flavor=flavor, ranges=[bounds])["results"], filtered):
+        assert [row[level] for level in LEVELS] == [other[level] for level in LEVELS]
+        assert row["n_gt"] == other["n_gt"]
+        compared += row["hard"] is not None and row["hard"] > 0
+    assert compared > 8
+
+
 def test_range_rules_differ_for_a_detection_across_the_border() -> None:
     labels = [[thing(z=29.9)] for _ in range(50)]
     across = [[as_found(thing(z=30.1), 0.5), as_found(thing(x=9, z=40), 0.9)] for _ in range(50)]
