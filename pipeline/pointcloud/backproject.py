@@ -2,7 +2,11 @@
 
 With P2 = [fu 0 cu p0; 0 fv cv p1; ...] the rectified camera point of pixel (u, v) is
 x = (u - cu) / fu * z - p0 / fu, y = (v - cv) / fv * z - p1 / fv, z = depth: the last terms are the baseline of the
-colour camera (KITTI devkit). It is then moved by T_velo_cam. All in float64, rounded to float32 once at the end.
+colour camera (KITTI devkit). In the LiDAR frame, with T_velo_cam = [R | t], that is
+
+    depth * (R @ ((u - cu) / fu, (v - cv) / fv, 1)) + (R @ (-p0 / fu, -p1 / fv, 0) + t)
+
+a direction per pixel and one origin, the colour camera's. In float64, rounded to float32 once at the end.
 """
 
 from __future__ import annotations
@@ -22,33 +26,34 @@ from pipeline.pointcloud.clouds import DenseCloud
 class PixelRays:
     """What back-projection needs of a calibration.
 
-    slope_u   (W,) float64 (u - cu) / fu        slope_v  (H,) float64 (v - cv) / fv
-    baseline  (2,) float64 -p0 / fu, -p1 / fv, metres
-    T_velo_cam  (4, 4) float64, rectified camera 0 -> LiDAR
+    slope_u  (W,) float64 (u - cu) / fu
+    slope_v  (H,) float64 (v - cv) / fv
+    R        (3, 3) float64, rectified camera 0 -> LiDAR
+    origin   (3,) float64, the colour camera in the LiDAR frame, metres
     """
 
     slope_u: NDArray[np.float64]
     slope_v: NDArray[np.float64]
-    baseline: NDArray[np.float64]
-    T_velo_cam: NDArray[np.float64]
+    R: NDArray[np.float64]
+    origin: NDArray[np.float64]
 
     @classmethod
     def of(cls, calibration: Calibration, image_size: tuple[int, int]) -> PixelRays:
         """The rays of an (H, W) image."""
         height, width = image_size
-        P2 = calibration.P2
+        P2, T = calibration.P2, calibration.T_velo_cam
         slope_u, slope_v = (np.arange(width) - P2[0, 2]) / P2[0, 0], (np.arange(height) - P2[1, 2]) / P2[1, 1]
-        baseline = np.array([-P2[0, 3] / P2[0, 0], -P2[1, 3] / P2[1, 1]])
-        return cls(slope_u, slope_v, baseline, np.ascontiguousarray(calibration.T_velo_cam))
+        x, y = -P2[0, 3] / P2[0, 0], -P2[1, 3] / P2[1, 1]
+        return cls(slope_u, slope_v, np.ascontiguousarray(T[:3, :3]), T[:3, 0] * x + T[:3, 1] * y + T[:3, 3])
 
     def project_rows(self, depth: NDArray[np.float32], top: int, block: NDArray[np.float32]) -> int:
         """Write the points of whole image rows from `top` on into (3, rows * W) `block`; how many it took."""
-        return int(_project_rows(depth, top, self.slope_u, self.slope_v, self.baseline, self.T_velo_cam, block))
+        return int(_project_rows(depth, top, self.slope_u, self.slope_v, self.R, self.origin, block))
 
     def project_pixels(self, depth: NDArray[np.float32], pixels: NDArray[np.int32]) -> NDArray[np.float32]:
         """(N,) pixels row * W + column -> (N, 3) float32 points, LiDAR frame."""
         points = np.empty((len(pixels), 3), np.float32)
-        _project_pixels(depth, pixels, self.slope_u, self.slope_v, self.baseline, self.T_velo_cam, points)
+        _project_pixels(depth, pixels, self.slope_u, self.slope_v, self.R, self.origin, points)
         return points
 
 
@@ -84,27 +89,24 @@ def _usable(depth, keep, kept):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _project_rows(depth, top, slope_u, slope_v, baseline, T, block):  # type: ignore[no-untyped-def]
+def _project_rows(depth, top, slope_u, slope_v, R, origin, block):  # type: ignore[no-untyped-def]
     height, width = depth.shape
     rows = min(block.shape[1] // width, height - top)
     for row in range(rows):
         for axis in range(3):
+            across, along = R[axis, 0], R[axis, 1] * slope_v[top + row] + R[axis, 2]
             for column in range(width):
-                z = np.float64(depth[top + row, column])
-                x = slope_u[column] * z + baseline[0]
-                y = slope_v[top + row] * z + baseline[1]
-                block[axis, row * width + column] = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] * z + T[axis, 3]
+                direction = across * slope_u[column] + along
+                block[axis, row * width + column] = depth[top + row, column] * direction + origin[axis]
     return rows
 
 
 @njit(cache=True, nogil=True)
-def _project_pixels(depth, pixels, slope_u, slope_v, baseline, T, points):  # type: ignore[no-untyped-def]
+def _project_pixels(depth, pixels, slope_u, slope_v, R, origin, points):  # type: ignore[no-untyped-def]
     width = depth.shape[1]
     for i in range(pixels.size):
         row = pixels[i] // width
         column = pixels[i] - row * width
-        z = np.float64(depth[row, column])
-        x = slope_u[column] * z + baseline[0]
-        y = slope_v[row] * z + baseline[1]
         for axis in range(3):
-            points[i, axis] = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] * z + T[axis, 3]
+            direction = R[axis, 0] * slope_u[column] + (R[axis, 1] * slope_v[row] + R[axis, 2])
+            points[i, axis] = depth[row, column] * direction + origin[axis]

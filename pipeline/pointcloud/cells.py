@@ -52,62 +52,62 @@ def occupied_cells(points: NDArray[np.float32], inverse_size: float, what: str) 
     """
     if points.ndim != 2 or points.shape[1] < 3 or points.dtype != np.float32:
         raise ValueError(f"{what}: expected (N, 3 or more) float32 points, got {points.shape} {points.dtype}")
-    run_start, run_key = np.empty(len(points) + 1, np.int32), np.empty(len(points), np.int64)
-    kept, runs = np.ones(len(points), np.bool_), 0
+    builder, kept = CellBuilder(len(points), inverse_size, what), np.ones(len(points), np.bool_)
     for first in range(0, len(points), _BLOCK):
-        block = np.ascontiguousarray(points[first : first + _BLOCK, :3].T)
-        runs = cut_into_runs(block, first, kept, inverse_size, runs, run_start, run_key)
+        builder.add(np.ascontiguousarray(points[first : first + _BLOCK, :3].T), first, kept)
+    return builder.cells()
+
+
+class CellBuilder:
+    """Numbers the cells of `points` points that come block by block."""
+
+    def __init__(self, points: int, inverse_size: float, what: str) -> None:
+        self.inverse_size, self.what = inverse_size, what
+        self.run_start, self.run_cell, self.runs = np.zeros(points + 1, np.int32), np.empty(points, np.int32), 0
+        # Sized for the cells, not for the points; it grows when half full.
+        capacity = 1 << 10
+        while capacity < min(points // 2, _LARGEST_FIRST_CAPACITY):
+            capacity *= 2
+        self.table, self.keys, self.count = np.full(capacity, -1, np.int32), np.empty(capacity // 2, np.int64), 0
+
+    def add(self, block: NDArray[np.float32], first: int, kept: NDArray[np.bool_]) -> tuple[int, int]:
+        """Number the next (3, n) block, whose points are `first` and the following; gives its range of runs.
+
+        Points that `kept` (of all points) does not mark are left out. Raises ValueError for a kept point without cell.
+        """
+        begin, width = self.runs, block.shape[1]
+        # One entry more than points: the last run ends where the key -2 follows, which no point has.
+        keys, run_key = np.full(width + 1, -2, np.int64), np.empty(width, np.int64)
+        runs = _cut_into_runs(block, first, kept, self.inverse_size, keys, run_key, self.run_start[begin:])
         if runs < 0:
-            refuse(bool(np.isfinite(points[:, :3]).all()), inverse_size, what)
-    return numbered(run_start[: runs + 1], run_key[:runs], len(points))
+            self._refuse(bool(np.isfinite(block).all()))
+        self.runs += runs
+        self._number(run_key[:runs], self.run_cell[begin : self.runs])
+        return begin, self.runs
 
+    def cells(self) -> Cells:
+        """All cells so far."""
+        runs = self.runs
+        return Cells(self.run_start[: runs + 1], self.run_cell[:runs], self.keys[: self.count], self.table)
 
-def cut_into_runs(
-    block: NDArray[np.float32],
-    first: int,
-    kept: NDArray[np.bool_],
-    inverse_size: float,
-    runs: int,
-    run_start: NDArray[np.int32],
-    run_key: NDArray[np.int64],
-) -> int:
-    """Append the runs of a (3, n) block, whose points are numbered from `first`, behind the `runs` there are.
+    def _number(self, run_key: NDArray[np.int64], run_cell: NDArray[np.int32]) -> None:
+        done, self.count = _number(run_key, run_cell, self.table, self.keys, 0, self.count)
+        while done < len(run_key):
+            capacity = 4 * len(self.table)
+            self.table, old_keys = np.full(capacity, -1, np.int32), self.keys
+            self.keys = np.empty(capacity // 2, np.int64)
+            self.keys[: self.count] = old_keys
+            _refill(self.table, self.keys, self.count)
+            done, self.count = _number(run_key, run_cell, self.table, self.keys, done, self.count)
 
-    Points that `kept` (of all points) does not mark get key -1. Returns the new number of runs, or -1 when a kept
-    point has no cell (NaN, infinite, too far).
-    """
-    if runs == 0:
-        run_start[0] = 0
-    # One entry more than points: the last run ends where the key -2 follows, which no point has.
-    keys = np.full(block.shape[1] + 1, -2, np.int64)
-    return int(_cut_into_runs(block, first, kept, inverse_size, keys, runs, run_start, run_key))
-
-
-def refuse(finite: bool, inverse_size: float, what: str) -> None:
-    """Raise the ValueError for points that have no cell."""
-    if not finite:
-        raise ValueError(f"{what}: the points hold NaN or infinite values; drop them first")
-    raise ValueError(
-        f"{what}: a point lies more than {CELL_LIMIT / inverse_size:g} m from the origin, too far for cells of "
-        f"{1 / inverse_size:g} m; are the coordinates metres in the LiDAR frame?"
-    )
-
-
-def numbered(run_start: NDArray[np.int32], run_key: NDArray[np.int64], points: int) -> Cells:
-    """Number the cells of runs (key -1: left out) in order of first appearance."""
-    capacity = 1 << 10
-    while capacity < min(points // 2, _LARGEST_FIRST_CAPACITY):
-        capacity *= 2
-    # Sized for the cells, not for the points: it grows fourfold when half full and the count goes on where it stood.
-    run_cell = np.empty(len(run_key), np.int32)
-    table, keys = np.full(capacity, -1, np.int32), np.empty(capacity // 2, np.int64)
-    done, count = _number(run_key, run_cell, table, keys, 0, 0)
-    while done < len(run_key):
-        capacity *= 4
-        table, keys = np.full(capacity, -1, np.int32), np.concatenate([keys, np.empty(capacity // 2 - count, np.int64)])
-        _refill(table, keys, count)
-        done, count = _number(run_key, run_cell, table, keys, done, count)
-    return Cells(run_start, run_cell, keys[:count], table)
+    def _refuse(self, finite: bool) -> None:
+        if not finite:
+            raise ValueError(f"{self.what}: the points hold NaN or infinite values; drop them first")
+        size = 1 / self.inverse_size
+        raise ValueError(
+            f"{self.what}: a point lies more than {CELL_LIMIT * size:g} m from the origin, too far for cells of "
+            f"{size:g} m; are the coordinates metres in the LiDAR frame?"
+        )
 
 
 def mark_near(
@@ -148,8 +148,9 @@ def _slot(key, capacity):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _cut_into_runs(block, first, kept, inverse_size, keys, runs, run_start, run_key):  # type: ignore[no-untyped-def]
-    count, wrong = block.shape[1], 0
+def _cut_into_runs(block, first, kept, inverse_size, keys, run_key, run_start):  # type: ignore[no-untyped-def]
+    """Keys of a block's runs (-1: left out) and where they start; how many, or -1 when a kept point has no cell."""
+    count, wrong, runs = block.shape[1], 0, 0
     for i in range(count):
         x, y, z = block[0, i] * inverse_size, block[1, i] * inverse_size, block[2, i] * inverse_size
         key = _pack(np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(z)))

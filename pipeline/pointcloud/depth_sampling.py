@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.calibration import Calibration
 from pipeline.pointcloud.backproject import PixelRays, usable_pixels
-from pipeline.pointcloud.cells import Cells, cut_into_runs, numbered, refuse
+from pipeline.pointcloud.cells import CellBuilder, Cells
 from pipeline.pointcloud.clouds import DenseCloud
 from pipeline.pointcloud.grid_sampling import GridSampling, add_block, first_of_cells, nearest_in_block, settle
 
@@ -39,23 +39,18 @@ def back_project_and_sample(
     """
     depth, kept = usable_pixels(depth, keep)
     rays = PixelRays.of(calibration, (depth.shape[0], depth.shape[1]))
-    cells = _cells(depth, kept.reshape(-1), rays, 1.0 / grid.size)
+    cells, sums, runs_of_block = _cells_and_sums(depth, kept.reshape(-1), rays, grid)
     if grid.representative == "first":
         pixels = first_of_cells(cells).astype(np.int32)
         return DenseCloud(rays.project_pixels(depth, pixels), pixels)
-    sums = np.zeros((len(cells), 4))
-    at = 0
-    for block in _blocks(depth, rays):
-        settle(block.points)
-        at = add_block(block.points, block.first, cells, at, sums)
     sums[:, :3] /= sums[:, 3:]
     if grid.representative == "centroid":
         return DenseCloud(sums[:, :3].astype(np.float32), first_of_cells(cells).astype(np.int32))
     sums[:, 3] = np.inf
-    pixels, at = np.zeros(len(cells), np.int32), 0
-    for block in _blocks(depth, rays):
+    pixels = np.zeros(len(cells), np.int32)
+    for block, runs in zip(_blocks(depth, rays), runs_of_block):
         settle(block.points)
-        at = nearest_in_block(block.points, block.first, cells, at, sums, pixels)
+        nearest_in_block(block.points, block.first, cells, runs, sums, pixels)
     return DenseCloud(rays.project_pixels(depth, pixels), pixels)
 
 
@@ -72,12 +67,18 @@ def _blocks(depth: NDArray[np.float32], rays: PixelRays) -> Iterator[_Block]:
         top += rows
 
 
-def _cells(depth: NDArray[np.float32], kept: NDArray[np.bool_], rays: PixelRays, inverse_size: float) -> Cells:
-    """Occupied cells of the kept pixels."""
-    run_start, run_key = np.empty(depth.size + 1, np.int32), np.empty(depth.size, np.int64)
-    runs = 0
+def _cells_and_sums(
+    depth: NDArray[np.float32], kept: NDArray[np.bool_], rays: PixelRays, grid: GridSampling
+) -> tuple[Cells, NDArray[np.float64], list[tuple[int, int]]]:
+    """Occupied cells of the kept pixels, (M, 4) sums of x, y, z and count (zero for "first"), and each block's runs."""
+    builder = CellBuilder(depth.size, 1.0 / grid.size, "grid sampling")
+    sums, runs_of_block = np.zeros((len(builder.keys), 4)), []
     for block in _blocks(depth, rays):
-        runs = cut_into_runs(block.points, block.first, kept, inverse_size, runs, run_start, run_key)
-        if runs < 0:
-            refuse(True, inverse_size, "grid sampling")
-    return numbered(run_start[: runs + 1], run_key[:runs], depth.size)
+        runs = builder.add(block.points, block.first, kept)
+        runs_of_block.append(runs)
+        if grid.representative != "first":
+            if len(sums) < builder.count:
+                sums = np.concatenate([sums, np.zeros((len(builder.keys) - len(sums), 4))])
+            settle(block.points)
+            add_block(block.points, block.first, builder.cells(), runs, sums)
+    return builder.cells(), sums[: builder.count], runs_of_block

@@ -49,7 +49,7 @@ def grid_sample(points: NDArray[np.float32], grid: GridSampling) -> NDArray[np.i
     settle(columns)
     centroids = _centroids(columns, cells)
     centroids[:, 3] = np.inf
-    nearest_in_block(columns, 0, cells, 0, centroids, nearest)
+    nearest_in_block(columns, 0, cells, (0, len(cells.run_cell)), centroids, nearest)
     return nearest.astype(np.int64)
 
 
@@ -67,7 +67,7 @@ def grid_sampling(cloud: DenseCloud, grid: GridSampling) -> DenseCloud:
 def _centroids(columns: NDArray[np.float32], cells: Cells) -> NDArray[np.float64]:
     """(3, N) points -> (M, 4) centroid and number of members of every cell."""
     sums = np.zeros((len(cells), 4))
-    add_block(columns, 0, cells, 0, sums)
+    add_block(columns, 0, cells, (0, len(cells.run_cell)), sums)
     sums[:, :3] /= sums[:, 3:]
     return sums
 
@@ -89,27 +89,26 @@ def settle(points: NDArray[np.float32]) -> None:
     _settle(points)
 
 
-def add_block(points: NDArray[np.float32], first: int, cells: Cells, run: int, sums: NDArray[np.float64]) -> int:
-    """Add a settled (3, n) block to (M, 4) `sums` of x, y, z and count.
-
-    The block's points are numbered from `first` and begin with run `run`; returns the run behind them.
-    """
-    return int(_add_block(points, first, cells.run_start, cells.run_cell, run, sums))
+def add_block(
+    points: NDArray[np.float32], first: int, cells: Cells, runs: tuple[int, int], sums: NDArray[np.float64]
+) -> None:
+    """Add a settled (3, n) block, whose points are numbered from `first`, to (M, 4) `sums` of x, y, z and count."""
+    _add_block(points, first, cells.run_start, cells.run_cell, runs, sums)
 
 
 def nearest_in_block(
     points: NDArray[np.float32],
     first: int,
     cells: Cells,
-    run: int,
+    runs: tuple[int, int],
     centroids: NDArray[np.float64],
     nearest: NDArray[np.int32],
-) -> int:
+) -> None:
     """Update (M,) `nearest`, the point nearest to each centroid; column 3 of `centroids` is its squared distance.
 
     Block and runs as in `add_block`. Of equally near points the first wins.
     """
-    return int(_nearest_in_block(points, first, cells.run_start, cells.run_cell, run, centroids, nearest))
+    _nearest_in_block(points, first, cells.run_start, cells.run_cell, runs, centroids, nearest)
 
 
 @njit(cache=True, nogil=True)
@@ -129,7 +128,7 @@ def _settle(points):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _add_block(points, first, run_start, run_cell, run, sums):  # type: ignore[no-untyped-def]
+def _add_block(points, first, run_start, run_cell, runs, sums):  # type: ignore[no-untyped-def]
     count = points.shape[1]
     # Sums up to each point: a run's sum is the difference at its ends, without a loop of unforeseeable length.
     upto = np.empty((count + 1, 3))
@@ -140,20 +139,17 @@ def _add_block(points, first, run_start, run_cell, run, sums):  # type: ignore[n
         y += points[1, i]
         z += points[2, i]
     upto[count, 0], upto[count, 1], upto[count, 2] = x, y, z
-    while run < run_cell.size and run_start[run] < first + count:
+    for run in range(runs[0], runs[1]):
         cell, start, end = run_cell[run], run_start[run] - first, run_start[run + 1] - first
         if cell >= 0:
             for axis in range(3):
                 sums[cell, axis] += upto[end, axis] - upto[start, axis]
             sums[cell, 3] += end - start
-        run += 1
-    return run
 
 
 @njit(cache=True, nogil=True)
-def _nearest_in_block(points, first, run_start, run_cell, run, centroids, nearest):  # type: ignore[no-untyped-def]
-    end = first + points.shape[1]
-    while run < run_cell.size and run_start[run] < end:
+def _nearest_in_block(points, first, run_start, run_cell, runs, centroids, nearest):  # type: ignore[no-untyped-def]
+    for run in range(runs[0], runs[1]):
         cell = run_cell[run]
         if cell >= 0:
             x, y, z, smallest = centroids[cell, 0], centroids[cell, 1], centroids[cell, 2], centroids[cell, 3]
@@ -165,5 +161,3 @@ def _nearest_in_block(points, first, run_start, run_cell, run, centroids, neares
                 smallest = distance if nearer else smallest
                 best = first + i if nearer else best
             centroids[cell, 3], nearest[cell] = smallest, best
-        run += 1
-    return run

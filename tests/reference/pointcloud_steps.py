@@ -15,13 +15,14 @@ def back_project(depth: NDArray, calibration: Calibration, keep: NDArray) -> tup
     """Points (N, 3) float32 and pixels (N,) by one loop over the image."""
     (fu, _, cu, p0), (_, fv, cv, p1) = calibration.P2[0], calibration.P2[1]
     T = calibration.T_velo_cam
+    origin = [T[a, 0] * (-p0 / fu) + T[a, 1] * (-p1 / fv) + T[a, 3] for a in range(3)]
     points, pixels = [], []
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             if keep[v, u] and depth[v, u] > 0:
-                z = float(depth[v, u])
-                x, y = (u - cu) / fu * z + -p0 / fu, (v - cv) / fv * z + -p1 / fv
-                points.append([T[a, 0] * x + T[a, 1] * y + T[a, 2] * z + T[a, 3] for a in range(3)])
+                ray = (u - cu) / fu, (v - cv) / fv, 1.0
+                direction = [T[a, 0] * ray[0] + (T[a, 1] * ray[1] + T[a, 2] * ray[2]) for a in range(3)]
+                points.append([float(depth[v, u]) * direction[a] + origin[a] for a in range(3)])
                 pixels.append(v * depth.shape[1] + u)
     return np.array(points, np.float64).reshape(-1, 3).astype(np.float32), np.array(pixels, np.int64)
 
