@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config import Config
 from pipeline.data import Dataset
-from pipeline.errors import UsageError
+from pipeline.errors import DataError, UsageError
 from pipeline.frame_files import FrameFiles
 from pipeline.paths import RunFolder
 from pipeline.settings import plain, with_changes
@@ -64,20 +63,27 @@ def train_stage(config: Config, run: RunFolder) -> Path:
     dataset = open_frames(config, run)
     out = run.weights / config.train.network
     print(f"training the {config.train.network} network on {len(dataset)} frames; state, log and weights: {out}")
-    if config.train.network == "completion":
-        return train_completion(config, dataset, out)
-    return train_detection(config, CloudSamples(dataset, config, run), out)
+    try:
+        if config.train.network == "completion":
+            return train_completion(config, dataset, out)
+        return train_detection(config, CloudSamples(dataset, config, run), out)
+    except DataError:
+        raise
+    except ValueError as error:
+        raise UsageError(f"train: {error}") from None
 
 
 def train_completion(config: Config, dataset: Dataset, out: Path) -> Path:
     """`completion.train` on frames with true depth; the run's seed unless the section has its own."""
-    from completion.models import ModelSpec
+    from completion.models import default_spec
     from completion.train import TrainSettings, train
 
     if not dataset[0].has("target_depth"):
         raise UsageError(f"{dataset.root}: frame {dataset.ids[0]} has no true depth to train completion on")
-    changes = _library_keys(config)
-    base = TrainSettings(ModelSpec("twise", {"width": 16}, depth_unit=80.0, output="twin"), seed=config.seed)
+    changes = config.train.library
+    # Another architecture brings its own input scaling, which single keys may still change.
+    architecture = str(changes.get("model", {}).get("architecture", "twise"))
+    base = TrainSettings(default_spec(architecture), seed=config.seed)
     settings = with_changes(base, changes, "train")
     return train(settings, DepthSamples(dataset), out, facts=training_facts(config))
 
@@ -88,17 +94,13 @@ def train_detection(config: Config, samples: CloudSamples, out: Path) -> Path:
 
     if not samples.dataset[0].has("labels"):
         raise UsageError(f"{samples.dataset.root}: frame {samples.dataset.ids[0]} has no label to train detection on")
-    settings = with_changes(TrainSettings(seed=config.seed), _library_keys(config), "train")
+    settings = with_changes(TrainSettings(seed=config.seed), config.train.library, "train")
 
     def report(progress: Any) -> None:
         losses = "  ".join(f"{name} {value:.3f}" for name, value in progress.losses.items())
         print(f"step {progress.step} of {progress.steps}  {losses}", flush=True)
 
     return train(settings, samples, out, config.detection.device, report)
-
-
-def _library_keys(config: Config) -> Mapping[str, Any]:
-    return config.train.library
 
 
 def training_facts(config: Config) -> dict[str, Any]:

@@ -25,7 +25,7 @@ FOLDER = Path(__file__).resolve().parent
 
 @dataclass(frozen=True)
 class MapPicture:
-    """A map of a frame: caption, picture, and the legend it is read with ("depth" or "sigma")."""
+    """A map of a frame: caption, picture, and the legend it is read with ("depth", "sigma" or "error")."""
 
     caption: str
     uri: str
@@ -92,7 +92,7 @@ def render(run: RunFolder, views: list[FrameView], total: int) -> str:
         steps=metrics.get("augmentation", []),
         failures=failures.get("failures", []),
         config=run.config.read_text(encoding="utf-8") if run.config.is_file() else "",
-        legends=legends(),
+        legends=legends({map.legend for view in views for map in view.maps}),
         bev=pictures.BirdsEye(),
         bev_scale=pictures.BEV_PIXELS_PER_METRE,
         bev_rings=(20, 40, 60),
@@ -102,29 +102,31 @@ def render(run: RunFolder, views: list[FrameView], total: int) -> str:
 def headline(metrics: dict[str, Any], frames: int) -> list[tuple[str, str, str]]:
     """(value, name, remark) of the figures at the top."""
     facts = [(str(frames), "frames", "")]
-    for row in metrics.get("results", []):
-        if (
-            row["class"] == "Car"
-            and row["metric"] in ("3d", "bev")
-            and row["moderate"] is not None
-            and row["iou"] == 0.7
-        ):
-            name = "Car 3D AP" if row["metric"] == "3d" else "Car bird's-eye AP"
-            remark = f"moderate, IoU 0.7, R{row['recall_points']}, {row['n_gt'][1]} cars"
-            facts.append((f"{row['moderate']:.1f}", name, remark))
+    for metric, name in (("3d", "Car 3D AP"), ("bev", "Car bird's-eye AP")):
+        for row in metrics.get("results", []):
+            if (row["class"], row["metric"], row["iou"]) == ("Car", metric, 0.7) and row["moderate"] is not None:
+                remark = f"moderate, IoU 0.7, R{row['recall_points']}, {row['n_gt'][1]} cars"
+                facts.append((f"{row['moderate']:.1f}", name, remark))
     steps = metrics.get("augmentation", [])
     if steps:
         facts.append((f"{steps[-1]['out']:,}", "points per frame", "mean of the augmented clouds"))
     return facts
 
 
-def legends() -> dict[str, dict[str, Any]]:
-    """The two colour scales of the page: CSS gradient and ticks (percent from the left, text)."""
-    depth = [(pictures.tick_position(metres), f"{metres} m") for metres in pictures.DEPTH_TICKS]
-    sigma = [(0, "0 background"), (50, "0.5"), (100, "1 foreground")]
+def legends(used: set[str]) -> dict[str, dict[str, Any]]:
+    """The colour scales that the page uses: CSS gradient and ticks (percent from the left, text)."""
+    depth = [(pictures.tick_position(metres), f"{metres}") for metres in pictures.DEPTH_TICKS]
+    error = [(pictures.error_position(metres), f"{metres:g}") for metres in pictures.ERROR_TICKS]
+    sigma = [(0.0, "0 background"), (50.0, "0.5"), (100.0, "1 foreground")]
+    scales = {
+        "depth": ("Depth, m", pictures.depth_colours(), depth),
+        "sigma": ("Sigma", pictures.sigma_colours(), sigma),
+        "error": ("Error, m", pictures.error_colours(), error),
+    }
     return {
-        "depth": {"title": "Depth", "gradient": pictures.gradient(pictures.depth_colours()), "ticks": depth},
-        "sigma": {"title": "Sigma", "gradient": pictures.gradient(pictures.sigma_colours()), "ticks": sigma},
+        name: {"title": title, "gradient": pictures.gradient(colours), "ticks": ticks}
+        for name, (title, colours, ticks) in scales.items()
+        if name in used
     }
 
 
@@ -160,6 +162,7 @@ def _add_maps(frame: Frame, files: FrameFiles, view: FrameView) -> None:
         add("sigma, weight of the foreground", pictures.colour_sigma(completed.sigma, completed.depth > 0), "sigma")
     if frame.has("target_depth"):
         add("true depth", pictures.colour_depth(frame.target_depth))
+        add("error of the completed depth", pictures.colour_error(completed.depth, frame.target_depth), "error")
 
 
 def _add_cloud(frame: Frame, files: FrameFiles, view: FrameView) -> None:

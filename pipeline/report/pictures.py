@@ -14,6 +14,9 @@ RGB = NDArray[np.uint8]
 # Depth is coloured over this range on a logarithmic scale: a car length matters more at 8 m than at 60 m.
 NEAR, FAR = 2.0, 80.0
 DEPTH_TICKS = (2, 5, 10, 20, 40, 80)
+# Depth error is coloured from 0 to this on a square root scale.
+LARGEST_ERROR = 5.0
+ERROR_TICKS = (0.0, 0.2, 1.0, 2.5, 5.0)
 NO_VALUE = np.array([24, 28, 34], np.uint8)
 
 # Bird's-eye view, metres: forward from the sensor and to both sides.
@@ -62,6 +65,27 @@ def colour_sigma(sigma: NDArray[np.float32], valid: NDArray[np.bool_]) -> RGB:
     picture = sigma_colours()[(sigma.clip(0, 1) * 255).round().astype(np.uint8)]
     picture[~valid] = NO_VALUE
     return np.asarray(picture, dtype=np.uint8)
+
+
+def error_colours() -> RGB:
+    """(256, 3) RGB from no error (pale) to large (dark red)."""
+    stops = np.array([[255, 247, 236], [253, 212, 158], [252, 141, 89], [215, 48, 31], [90, 0, 0]], float)
+    at = np.linspace(0, 1, len(stops))
+    steps = np.linspace(0, 1, 256)
+    return np.stack([np.interp(steps, at, stops[:, c]) for c in range(3)], axis=1).round().astype(np.uint8)
+
+
+def colour_error(depth: NDArray[np.float32], target: NDArray[np.float32]) -> RGB:
+    """|depth - target| of two (H, W) maps in metres -> RGB; pixels without either take the dark colour."""
+    share = np.sqrt(np.abs(depth - target) / LARGEST_ERROR).clip(0, 1)
+    picture = error_colours()[(share * 255).astype(np.uint8)]
+    picture[(depth <= 0) | (target <= 0)] = NO_VALUE
+    return np.asarray(picture, dtype=np.uint8)
+
+
+def error_position(metres: float) -> float:
+    """Place of an error on the legend, percent from the left."""
+    return float(100 * np.sqrt(metres / LARGEST_ERROR))
 
 
 def gradient(colours: RGB) -> str:

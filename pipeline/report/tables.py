@@ -39,7 +39,12 @@ def _range_text(bounds: Sequence[float | None]) -> str:
 
 def depth_rows(metrics: dict[str, Any]) -> list[list[str]]:
     """Depth measure and its mean over the frames with ground truth."""
-    return [[name, f"{value:.4g}"] for name, value in metrics.get("depth", {}).get("mean", {}).items()]
+    return [[name, number(value)] for name, value in metrics.get("depth", {}).get("mean", {}).items()]
+
+
+def number(value: float) -> str:
+    """Four significant digits without an exponent: 0.1428, 305.4, 15,940."""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
 def step_rows(metrics: dict[str, Any]) -> list[list[str]]:
@@ -66,7 +71,8 @@ def markdown_tables(metrics: dict[str, Any]) -> str:
     rows = ap_rows(metrics)
     if rows:
         parts.append("## Average precision (percent)\n\n" + markdown_table(ap_header(metrics), rows))
-    parts += [f"- {warning}\n" for warning in metrics.get("warnings", [])]
+    if metrics.get("warnings"):
+        parts.append("".join(f"- {warning}\n" for warning in metrics["warnings"]))
     without = metrics.get("frames", {}).get("without_label", [])
     if without:
         parts.append(f"Frames without a label, not scored: {', '.join(without)}\n")
