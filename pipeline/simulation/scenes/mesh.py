@@ -105,8 +105,8 @@ def tube(path: NDArray[np.float64], radii: NDArray[np.float64], sides: int, surf
     ring = first[:, None] * np.cos(angle)[None, :, None] + second[:, None] * np.sin(angle)[None, :, None]
     vertices = (path[:, None] + ring * radii[:, None, None]).reshape(-1, 3)
     count = len(vertices)
-    caps = [[count, (k + 1) % sides, k] for k in range(sides)]
-    caps += [[count + 1, count - sides + k, count - sides + (k + 1) % sides] for k in range(sides)]
+    caps = [[count, k, (k + 1) % sides] for k in range(sides)]
+    caps += [[count + 1, count - sides + (k + 1) % sides, count - sides + k] for k in range(sides)]
     faces = np.concatenate([grid_faces(len(path), sides, closed=True), np.array(caps)])
     return Part(np.concatenate([vertices, path[:1], path[-1:]]), faces, surface)
 
