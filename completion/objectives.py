@@ -27,6 +27,8 @@ class Objective:
     edge_weight      extra weight of pixels at depth edges of the target (0: none; 4: five times)
     relative_weight  share of a pixel's weight that falls with distance beyond 10 m (1: as 10 m / distance)
     below_top_ring   no loss above the topmost measured ring
+    deepest          metres; deeper targets are left out (beyond a LiDAR's range nothing can be learned, yet their
+                     errors outweigh the rest); 0: none are, as published
     auxiliary        weight of further outputs of a "dc" network (published: 0.8)
     """
 
@@ -39,6 +41,7 @@ class Objective:
     edge_weight: float = 0.0
     relative_weight: float = 0.0
     below_top_ring: bool = False
+    deepest: float = 0.0
     auxiliary: float = 0.8
 
     def __post_init__(self) -> None:
@@ -65,6 +68,8 @@ def fits(objective: Objective, spec: ModelSpec) -> None:
 def pixel_weights(sparse: Tensor, target: Tensor, objective: Objective) -> Tensor:
     """Weight of every pixel of the target (B, 1, H, W), metres; 0 where it has no value."""
     weights = losses.valid_weights(target)
+    if objective.deepest:
+        weights = weights * (target <= objective.deepest)
     if objective.below_top_ring:
         weights = weights * losses.below_top_ring(sparse)
     if objective.edge_weight:

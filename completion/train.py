@@ -149,13 +149,13 @@ def train(
     begin, step = time.monotonic(), run.step
     last_saved = begin
     for batches in run.batches(step):
-        parts = run.optimise(step, batches)
+        run.optimise(step, batches)
         step += 1
         now = time.monotonic()
         finished = step == run.total or _agreed(seconds is not None and now - begin > seconds, processes)
         validate = bool(settings.validate_every) and step % settings.validate_every == 0
         if step % settings.log_every == 0 or finished:
-            run.log(step, parts)
+            run.log(step)
         if len(validation) and (validate or step == run.total):
             run.validate(step, validation, facts or {})
         if finished or step % settings.checkpoint_steps == 0 or now - last_saved > settings.checkpoint_seconds:
@@ -212,6 +212,7 @@ class _Run:
         )
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=settings.precision == "fp16")
         self.step, self.best = 0, float("inf")
+        self.sums: dict[str, float] = {}  # loss parts since the last row of the log
         self._resume()
         self.forward: nn.Module = self.model
         if processes > 1:
@@ -223,7 +224,7 @@ class _Run:
             facts = load_state(path, self.model, self.optimiser, self.scaler)
             if facts["identity"] != self.settings.identity:
                 raise ValueError(f"{self.out}: holds a run with other settings; give another folder or remove it")
-            self.step, self.best = facts["step"], facts["best"]
+            self.step, self.best, self.sums = facts["step"], facts["best"], facts["sums"]
         for name in ("log.csv", "validation.csv"):
             _keep_rows(self.out / name, self.step)
 
@@ -239,8 +240,8 @@ class _Run:
         )
         return iter(loader)
 
-    def optimise(self, step: int, batches: list[Batch]) -> dict[str, float]:
-        """One optimiser step over its micro-batches; returns the mean loss parts."""
+    def optimise(self, step: int, batches: list[Batch]) -> None:
+        """One optimiser step over its micro-batches; the mean loss parts are kept for the log."""
         settings = self.settings
         rate = learning_rate(settings, step, self.steps_per_epoch, self.planned)
         for group in self.optimiser.param_groups:
@@ -258,7 +259,10 @@ class _Run:
             nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip_gradient)
         self.scaler.step(self.optimiser)
         self.scaler.update()
-        return {"learning_rate": rate} | {name: float(value) for name, value in sums.items()}
+        for name, value in sums.items():
+            self.sums[name] = self.sums.get(name, 0.0) + float(value)
+        self.sums["learning_rate"] = self.sums.get("learning_rate", 0.0) + rate
+        self.sums["steps"] = self.sums.get("steps", 0.0) + 1
 
     def _loss(self, step: int, batch: Batch) -> dict[str, Tensor]:
         settings, spec = self.settings, self.settings.model
@@ -277,8 +281,11 @@ class _Run:
             step / self.planned,
         )
 
-    def log(self, step: int, parts: dict[str, float]) -> None:
-        """A row of log.csv, and TensorBoard scalars."""
+    def log(self, step: int) -> None:
+        """A row of log.csv, and TensorBoard scalars: means since the last row."""
+        steps = self.sums.pop("steps")
+        parts = {name: value / steps for name, value in self.sums.items()}
+        self.sums = {}
         if not all(value == value for value in parts.values()):
             raise ValueError(f"{self.out}: the loss is NaN at step {step}; lower the learning rate or clip gradients")
         if self.rank == 0:
@@ -303,7 +310,7 @@ class _Run:
         if self.rank != 0:
             return
         save_checkpoint(self.out / "last", self.model, self._card(step, facts))
-        state = {"step": step, "best": self.best, "identity": self.settings.identity}
+        state = {"step": step, "best": self.best, "sums": self.sums, "identity": self.settings.identity}
         save_state(self.out / "state.safetensors", self.model, self.optimiser, self.scaler, state)
 
     @property

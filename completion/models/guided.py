@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from itertools import pairwise
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -51,13 +52,18 @@ class CompactUNet(nn.Module):
         self.head = nn.Conv2d(width, outputs * 4, 1)
 
     def forward(self, x: Tensor) -> Tensor:
+        return F.pixel_shuffle(self.head_at_half(x), 2)
+
+    def head_at_half(self, x: Tensor) -> Tensor:
+        """(B, inputs, H, W) -> (B, 4 outputs, H/2, W/2), what pixel shuffle takes."""
         features = [self.stem(F.pixel_unshuffle(x, 2))]
         for down in self.down:
             features.append(down(features[-1]))
         x = features.pop()
         for lift, up in zip(reversed(self.lift), reversed(self.up)):
             x = up(features.pop() + F.interpolate(lift(x), scale_factor=2, mode="nearest"))
-        return F.pixel_shuffle(self.head(x), 2)
+        head: Tensor = self.head(x)
+        return head
 
 
 class Guided(nn.Module):
@@ -69,7 +75,7 @@ class Guided(nn.Module):
     width     features at half resolution
     residual  largest relative correction of a surface (0.05: 5 %)
     tilt      initial exponent of the preference for near or far candidates
-    cut       weights below this share of 1 become 0
+    cut       weights below this share of the largest become 0
     """
 
     def __init__(
@@ -77,8 +83,8 @@ class Guided(nn.Module):
     ) -> None:
         super().__init__()
         self.candidates = candidate_count() + 1  # and one drawn from the image
-        if not 0 <= cut < 1 / self.candidates:
-            raise ValueError(f"cut: expected a value in [0, {1 / self.candidates:.3f}), got {cut}")
+        if not 0 <= cut < 1:
+            raise ValueError(f"cut: expected a share in [0, 1), got {cut}")
         self.residual, self.cut = residual, cut
         self.tilt_bias = math.log(math.expm1(tilt))
         # 2 sets of candidate logits, 2 tilts, 2 residuals, own candidate's log depth, sigma
@@ -89,17 +95,25 @@ class Guided(nn.Module):
 
     def forward(self, sparse: Tensor, rgb: Tensor) -> tuple[Tensor]:
         require_multiple(sparse, rgb, 64)
+        if torch.is_inference_mode_enabled() and sparse.device.type == "cpu":
+            return (self._forward_fused(sparse, rgb),)
         found = find_candidates(sparse)
         raw = self.network(torch.cat((rgb, self._depth_features(sparse, found)), 1))
         return (self._assemble(found, raw.float()),)
 
-    @staticmethod
-    def _depth_features(sparse: Tensor, found: Candidates) -> Tensor:
-        """(B, 11, H, W): log depths and distances of the rings above and below, the sample itself, the image row."""
+    def _depth_features(self, sparse: Tensor, found: Candidates) -> Tensor:
         rows = [0, 1, found.count - 2, found.count - 1]  # up, down, second up, second down
-        log_depth = found.log_depth[:, rows] - LOG_10M
-        nearness = torch.exp(found.prior[:, rows[:2]].clamp(min=-6.0))
-        missing = (found.prior[:, rows[:2]] < -20).to(sparse.dtype)
+        return self._ring_features(sparse, found.log_depth[:, rows], found.prior[:, rows])
+
+    @staticmethod
+    def _ring_features(sparse: Tensor, rings: Tensor, prior: Tensor) -> Tensor:
+        """(B, 11, H, W): log depths and distances of the rings above and below, the sample itself, the image row.
+
+        rings, prior  (B, 4, H, W) log depth and prior of the ring above, below, second above, second below
+        """
+        log_depth = rings - LOG_10M
+        nearness = torch.exp(prior[:, :2].clamp(min=-6.0))
+        missing = (prior[:, :2] < -20).to(sparse.dtype)
         measured = (sparse > 0).to(sparse.dtype)
         gap = log_depth[:, :1] - log_depth[:, 1:2]
         height = torch.linspace(-1, 1, sparse.shape[2], device=sparse.device, dtype=sparse.dtype)
@@ -120,6 +134,22 @@ class Guided(nn.Module):
 
     def _surface(self, logits: Tensor, inverse: Tensor, correction: Tensor) -> Tensor:
         """(B, 1, H, W) metres: convex combination in inverse depth without small weights, times 1 +- residual."""
-        weights = F.relu(torch.softmax(logits, 1) - self.cut)
+        relative = torch.exp(logits - logits.amax(1, keepdim=True))
+        weights = F.relu(relative - self.cut)
         mixed = (weights * inverse).sum(1, keepdim=True) / weights.sum(1, keepdim=True)
         return (1 + self.residual * torch.tanh(correction)) / mixed
+
+    def _forward_fused(self, sparse: Tensor, rgb: Tensor) -> Tensor:
+        """`forward` with everything but the convolutions in two numba passes."""
+        from completion.models.guided_cpu import assemble, log_and_prior, rings, shifts_array
+
+        parts = [log_and_prior(*rings(one.numpy())) for one in sparse[:, 0].float()]
+        four = [torch.from_numpy(np.stack(part)) for part in zip(*parts)]
+        features = self._ring_features(sparse, *four)
+        head = self.network.head_at_half(torch.cat((rgb, features), 1).contiguous(memory_format=torch.channels_last))
+        heads = head.float().permute(0, 2, 3, 1).contiguous().numpy()
+        outputs = [
+            assemble(own, *ring, shifts_array(), self.residual, self.cut, self.tilt_bias)
+            for own, ring in zip(heads, parts)
+        ]
+        return torch.from_numpy(np.stack(outputs))

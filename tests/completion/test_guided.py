@@ -78,8 +78,8 @@ def test_surfaces_are_ordered_and_of_one_of_two_objects() -> None:
     foreground, background, sigma = split_head(out, 1.0)
     assert bool((foreground <= background).all())
     between = slice(14, 37)
-    assert foreground[0, between].flatten().tolist() == pytest.approx([10.0] * 23 * 64, rel=2e-3)
-    assert background[0, between].flatten().tolist() == pytest.approx([40.0] * 23 * 64, rel=2e-3)
+    assert foreground[0, between].flatten().tolist() == pytest.approx([10.0] * 23 * 64, rel=5e-3)
+    assert background[0, between].flatten().tolist() == pytest.approx([40.0] * 23 * 64, rel=5e-3)
     assert sigma[0, 0, 0] == 0.5
 
 
@@ -111,4 +111,18 @@ def test_gradients_reach_every_parameter() -> None:
 
 def test_a_cut_that_could_leave_no_candidate_is_refused() -> None:
     with pytest.raises(ValueError, match="cut"):
-        Guided(cut=0.5)
+        Guided(cut=1.0)
+
+
+@pytest.mark.parametrize("cut", [0.02, 0.0])
+def test_fused_inference_agrees_with_torch(rng: np.random.Generator, cut: float) -> None:
+    torch.manual_seed(2)
+    model = Guided(width=8, cut=cut).eval()
+    torch.nn.init.normal_(model.network.head.weight, std=0.5)
+    sparse = torch.from_numpy(np.stack([sparse_map(rng, 64, 128), 0 * sparse_map(rng, 64, 128)]))[:, None]
+    rgb = torch.rand(2, 3, 64, 128)
+    with torch.no_grad():
+        (expected,) = model(sparse, rgb)
+    with torch.inference_mode():
+        (found,) = model(sparse, rgb)
+    torch.testing.assert_close(found, expected, rtol=2e-4, atol=2e-4)

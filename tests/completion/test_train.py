@@ -272,6 +272,7 @@ def test_pixel_weights() -> None:
     assert float(weights[0, 0, 5, 7]) == pytest.approx(1.0)
     assert float(weights[0, 0, 5, 4]) == pytest.approx(5.0)
     assert torch.equal(pixel_weights(sparse, target, Objective()), (target > 0).float())
+    assert pixel_weights(sparse, target, Objective(deepest=10.0))[..., :4].max() == 0
 
 
 def test_a_step_edge_teaches_two_surfaces() -> None:
