@@ -83,11 +83,11 @@ def test_glass_lets_pulses_through() -> None:
     pane = box(0.02, 6.0, 6.0, GLASS_CAR, -3.0).at(5.0, 0.0)
     tracer = Tracer(assemble([(0, [*_drum(15.0, WHITE), pane])]))  # type: ignore[list-item]
     points = scan(tracer, sensor(64), IDENTITY, np.random.default_rng(2))
-    behind = (points[:, 0] > 3) & (np.abs(points[:, 1] / points[:, 0]) < 0.3) & (np.abs(points[:, 2]) < 2)
+    behind = (points[:, 0] > 3) & (np.abs(points[:, 1]) < 0.3 * points[:, 0]) & (np.abs(points[:, 2]) < 2)
     reach = np.linalg.norm(points[behind, :2], axis=1)
     through, on_glass = int((reach > 14).sum()), int((reach < 8).sum())
     assert through > on_glass > 0
-    open_side = (points[:, 0] < -3) & (np.abs(points[:, 1] / points[:, 0]) < 0.3) & (np.abs(points[:, 2]) < 2)
+    open_side = (points[:, 0] < -3) & (np.abs(points[:, 1]) < -0.3 * points[:, 0]) & (np.abs(points[:, 2]) < 2)
     assert through + on_glass < 0.8 * open_side.sum()
 
 
@@ -133,7 +133,7 @@ def test_scan_splits_into_its_rings_and_subsets_keep_their_share(full_frame: Syn
 def test_rings_of_a_hand_made_scan() -> None:
     turn = np.radians(np.arange(1, 360, 10))
     ring = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(36)])
-    points = np.concatenate([ring + (0, 0, -k) for k in range(3)])
+    points = np.concatenate([ring - np.array([0, 0, k]) for k in range(3)])
     np.testing.assert_array_equal(split_rings(points), np.repeat([0, 1, 2], 36))
     np.testing.assert_array_equal(subsample_rows(points, 2), np.concatenate([points[:36], points[72:]]))
     # Two points that jitter over the forward direction do not make a ring of their own.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import filecmp
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -146,14 +147,15 @@ def test_kitti_depth_layout_reads_back(tmp_path: Path) -> None:
     assert dataset.ids == ("train/2000_01_01_drive_0000_sync/image_02/0000000005",)
     frame = dataset[dataset.ids[0]]
     assert frame.image.shape == (60, 200, 3)
-    assert (frame.sparse_depth > 0).sum() < (frame.target_depth > 0).sum()
+    assert frame.target_depth.shape == frame.sparse_depth.shape == (60, 200)
+    assert 0 < (frame.target_depth > 0).mean() < 1
     assert frame.calibration.P2[0, 0] == pytest.approx(721.5377 * 200 / 1242, rel=0.02)
     raw = tmp_path / "2000_01_01" / "2000_01_01_drive_0000_sync"
     assert len(list((raw / "velodyne_points" / "data").glob("*.bin"))) == 11
 
 
 def test_drives_move_and_keep_their_rig(drive: list[SyntheticFrame]) -> None:
-    step = [np.linalg.norm(b.T_world_cam[:3, 3] - a.T_world_cam[:3, 3]) for a, b in zip(drive, drive[1:])]
+    step = [np.linalg.norm(b.T_world_cam[:3, 3] - a.T_world_cam[:3, 3]) for a, b in pairwise(drive)]
     assert min(step) > 0.05
     assert max(step) < 1.3
     assert all(frame.calibration is drive[0].calibration for frame in drive)
