@@ -21,6 +21,20 @@ def edge_mask(target: FloatMap, window: int = 5) -> NDArray[np.bool_]:
     return (target > 0) & (largest - smallest > 1) & (largest > 1.1 * smallest)
 
 
+def measured_region(frame: DepthFrame, deepest: float = 80.0) -> FloatMap:
+    """Target (H, W) with 0 where a LiDAR says nothing: beyond `deepest` metres, and above its topmost sample nearby.
+
+    A frame without samples keeps all its target up to `deepest`. ValueError without a target.
+    """
+    if frame.target is None:
+        raise ValueError("expected a frame with a target")
+    target = np.where(frame.target <= deepest, frame.target, np.float32(0))
+    if not (frame.sparse > 0).any():
+        return target
+    near = cv2.dilate((frame.sparse > 0).astype(np.uint8), np.ones((1, 33), np.uint8))
+    return target * np.maximum.accumulate(near, axis=0)
+
+
 def sigma_statistics(completed: CompletedDepth, target: FloatMap, threshold: float = 1.0) -> dict[str, float]:
     """Sigma at pixels of depth edges whose surfaces differ by more than `threshold` metres.
 
@@ -62,17 +76,20 @@ def _scores(completed: CompletedDepth, target: FloatMap) -> dict[str, float]:
 
 def diagnose(completer: Completer, frames: Iterable[DepthFrame]) -> dict[str, float]:
     """Mean over frames with a target: MAE, tMAE (t = 1 m), edge tMAE in mm, mixed pixels in %; the MAE and tMAE with a
-    grey image (`grey_...`, equal when colour is ignored); sigma's statistics. Frames without an edge drop out of the
-    means that need one. ValueError when no frame has a target.
+    grey image (`grey_...`, equal when colour is ignored); sigma's statistics. All within `measured_region`. Frames
+    without an edge drop out of the means that need one. ValueError when no frame has a target.
     """
     rows: list[dict[str, float]] = []
     for frame in frames:
-        if frame.target is None or not (frame.target > 0).any():
+        if frame.target is None:
+            continue
+        target = measured_region(frame)
+        if not target.any():
             continue
         completed = completer.complete(frame.sparse, frame.image, frame.K)
         grey = completer.complete(frame.sparse, np.full_like(frame.image, 128), frame.K)
-        found = _scores(completed, frame.target) | sigma_statistics(completed, frame.target)
-        without = _scores(grey, frame.target)
+        found = _scores(completed, target) | sigma_statistics(completed, target)
+        without = _scores(grey, target)
         rows.append(found | {f"grey_{name}": without[name] for name in ("mae_mm", "tmae_mm")})
     if not rows:
         raise ValueError("no frame with a target to diagnose on")

@@ -26,7 +26,7 @@ class Objective:
     sigma_threshold  metres between the surfaces from which a pixel counts as ambiguous there
     edge_weight      extra weight of pixels at depth edges of the target (0: none; 4: five times)
     relative_weight  share of a pixel's weight that falls with distance beyond 10 m (1: as 10 m / distance)
-    below_top_ring   no loss above the topmost measured ring
+    above_top_ring   weight of pixels above the topmost measured ring, where nothing can be interpolated (0: no loss)
     deepest          metres; deeper targets are left out (beyond a LiDAR's range nothing can be learned, yet their
                      errors outweigh the rest); 0: none are, as published
     auxiliary        weight of further outputs of a "dc" network (published: 0.8)
@@ -40,7 +40,7 @@ class Objective:
     sigma_threshold: float = 1.0
     edge_weight: float = 0.0
     relative_weight: float = 0.0
-    below_top_ring: bool = False
+    above_top_ring: float = 1.0
     deepest: float = 0.0
     auxiliary: float = 0.8
 
@@ -70,8 +70,9 @@ def pixel_weights(sparse: Tensor, target: Tensor, objective: Objective) -> Tenso
     weights = losses.valid_weights(target)
     if objective.deepest:
         weights = weights * (target <= objective.deepest)
-    if objective.below_top_ring:
-        weights = weights * losses.below_top_ring(sparse)
+    if objective.above_top_ring != 1:
+        below = losses.below_top_ring(sparse)
+        weights = weights * (below + objective.above_top_ring * (1 - below))
     if objective.edge_weight:
         weights = weights * (1 + objective.edge_weight * losses.depth_edges(target))
     if objective.relative_weight:

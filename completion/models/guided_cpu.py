@@ -18,7 +18,7 @@ _BLOCK = 64  # columns one thread walks down together
 _FAR = np.float32(-30.0)
 
 
-@njit(parallel=True, cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(parallel=True, cache=True, nogil=True)
 def rings(sparse: Float) -> tuple[Float, Float]:
     """Sparse (H, W) -> depth and distance in rows, both (4, H, W): ring above, below, second above, second below.
 
@@ -62,12 +62,12 @@ def rings(sparse: Float) -> tuple[Float, Float]:
     return depth, rows
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@njit(inline="always")
 def _softplus(x: float) -> float:
     return x + math.log1p(math.exp(-x)) if x > 0 else math.log1p(math.exp(x))
 
 
-@njit(parallel=True, cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(parallel=True, cache=True, nogil=True)
 def assemble(
     head: Float,
     log_depth: Float,

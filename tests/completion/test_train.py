@@ -15,7 +15,7 @@ import torch
 from safetensors.torch import load_file
 
 from completion.checkpoints import load_checkpoint
-from completion.diagnostics import diagnose, edge_mask, sigma_statistics
+from completion.diagnostics import diagnose, edge_mask, measured_region, sigma_statistics
 from completion.infer import load_completer
 from completion.losses import twin_loss
 from completion.models import default_spec, with_rgb
@@ -266,7 +266,7 @@ def test_pixel_weights() -> None:
     target[0, 0, 0, 0] = 0
     sparse = torch.zeros_like(target)
     sparse[0, 0, 3] = 20.0
-    weights = pixel_weights(sparse, target, Objective(edge_weight=4, relative_weight=1.0, below_top_ring=True))
+    weights = pixel_weights(sparse, target, Objective(edge_weight=4, relative_weight=1.0, above_top_ring=0.0))
     assert weights[0, 0, :3].max() == 0
     assert float(weights[0, 0, 5, 0]) == pytest.approx(0.5)
     assert float(weights[0, 0, 5, 7]) == pytest.approx(1.0)
@@ -322,6 +322,17 @@ def test_diagnostics_compare_with_a_grey_image() -> None:
     assert diagnose(Looks(), [frame])["grey_mae_mm"] != diagnose(Looks(), [frame])["mae_mm"]
     with pytest.raises(ValueError, match="no frame with a target"):
         diagnose(Looks(), [DepthFrame(frame.image, frame.sparse)])
+
+
+def test_diagnostics_leave_out_what_was_not_measured() -> None:
+    target = np.full((10, 50), 20.0, np.float32)
+    target[:, 40:] = 90.0
+    sparse = np.zeros_like(target)
+    sparse[4, 10] = 20.0
+    image = np.zeros((10, 50, 3), np.uint8)
+    region = measured_region(DepthFrame(image, sparse, target))
+    assert (region > 0).sum() == 6 * 27  # rows 4-9, columns 0-26
+    assert (measured_region(DepthFrame(image, 0 * sparse, target)) > 0).sum() == 10 * 40
 
 
 def test_colour_scaling_is_part_of_the_model() -> None:
