@@ -10,7 +10,7 @@ import numpy as np
 from detection.evaluation.objects import Array, ObjectTable
 from detection.evaluation.overlaps import overlaps_of
 from detection.evaluation.protocol import Matcher, Target
-from detection.evaluation.reading import FramePair
+from detection.evaluation.reading import BROKEN_LINE, FramePair
 
 Change = Callable[[Array], Array]
 
@@ -20,7 +20,7 @@ _LEAST_GAIN, _LEAST_SHARE = 3, 0.2
 
 def likely_causes(matcher: Matcher, target: Target) -> list[str]:
     """One sentence per cause that would explain a low AP of the target's class; empty when none is recognised."""
-    causes = _about_labels(matcher, target) + _about_detections(matcher.pair.detections, target)
+    causes = _about_labels(matcher, target) + _about_detections(matcher.pair, target)
     if not causes:
         causes = _about_geometry(matcher.pair, target)
     return causes
@@ -41,7 +41,11 @@ def _about_labels(matcher: Matcher, target: Target) -> list[str]:
     return []
 
 
-def _about_detections(detections: ObjectTable, target: Target) -> list[str]:
+def _about_detections(pair: FramePair, target: Target) -> list[str]:
+    detections = pair.detections
+    broken = [message for kind, message in pair.problems if kind == BROKEN_LINE]
+    if len(detections) == 0 and broken:
+        return [f"no line of the result files could be used ({len(broken)} broken): {broken[0]}"]
     if len(detections) == 0:
         return ["every result file is empty: nothing was detected in any frame"]
     same = detections.is_type(target.cls)

@@ -117,7 +117,7 @@ class Evaluation:
             "results": rows,
             "exact": [self._side_row(target, exact_ap) for target in self.targets if target.metric != "aos"],
             "recall": [self._side_row(target, found_share) for target in self.targets if target.metric != "aos"],
-            "warnings": [*small_set_warnings(rows), *(message for _, message in problems)],
+            "warnings": [*small_set_warnings(rows), *skipped_summary(problems)],
             "skipped": {kind: sum(1 for found, _ in problems if found == kind) for kind, _ in problems},
             "protocol": self._protocol(),
         }
@@ -158,6 +158,19 @@ def found_share(records: MatchRecords) -> float:
     """Share in percent of the labels that count which are found when every detection is admitted."""
     n_labels = int(records.n_labels.sum())
     return 100.0 * int(records.tp.sum()) / n_labels if n_labels else 0.0
+
+
+def skipped_summary(problems: Sequence[tuple[str, str]], shown: int = 3) -> list[str]:
+    """The first messages of every kind of problem that was passed over, and how many more there are."""
+    by_kind: dict[str, list[str]] = {}
+    for kind, message in problems:
+        by_kind.setdefault(kind, []).append(message)
+    summary = []
+    for kind, messages in by_kind.items():
+        summary += messages[:shown]
+        if len(messages) > shown:
+            summary.append(f"{kind}: {len(messages) - shown} more were passed over")
+    return summary
 
 
 def small_set_warnings(rows: Sequence[ApRow]) -> list[str]:

@@ -106,8 +106,9 @@ def _draw_curves(evaluation: Evaluation, targets: list[Target], path: Path) -> N
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(3.4 * len(targets), 3.2), layout="constrained")
+    figure = Figure(figsize=(3.4 * len(targets), 3.4), layout="constrained")
     FigureCanvasAgg(figure)
+    figure.suptitle(f"AP with {evaluation.recall_points} recall points", fontsize=10)
     recall = np.arange(SAMPLES) / 40
     for place, target in enumerate(targets, start=1):
         axes = figure.add_subplot(1, len(targets), place)
@@ -117,7 +118,15 @@ def _draw_curves(evaluation: Evaluation, targets: list[Target], path: Path) -> N
         axes.set(xlim=(0, 1), ylim=(0, 1.02), xlabel="recall", title=_title(target))
         axes.set_ylabel("similarity" if target.metric == "aos" else "precision")
         axes.grid(alpha=0.3)
-        axes.legend(loc="best", title=f"AP R{evaluation.recall_points}")
+        axes.legend(
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.17),
+            ncols=3,
+            frameon=False,
+            fontsize=8,
+            columnspacing=1.0,
+            handlelength=1.2,
+        )
     figure.savefig(path, dpi=110)
 
 

@@ -16,6 +16,7 @@ from detection.evaluation.objects import FrameObjects, ObjectTable, build_table,
 from detection.kitti_format import parse_line
 
 MISSING = ("error", "skip", "empty")
+BROKEN_LINE = "broken line"
 
 PathLike = str | os.PathLike[str]
 
@@ -226,7 +227,7 @@ def read_table(folder: Path, frames: Sequence[str], *, scored: bool, problems: P
             try:
                 numbers.extend(_numbers(fields, width, f"{path}:{number}", scored))
             except ValueError as error:
-                problems.report("broken line", str(error))
+                problems.report(BROKEN_LINE, str(error))
                 continue
             names.append(fields[0])
             lines.append(number)

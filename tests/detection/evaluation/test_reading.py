@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from detection.evaluation.kitti_ap import evaluate
+from detection.evaluation.diagnose import likely_causes
+from detection.evaluation.kitti_ap import evaluate, prepare
 from detection.evaluation.reading import InputError, read_pair, read_split
 from detection.kitti_format import format_line
 from tests.detection.evaluation.scenes import thing
@@ -141,3 +142,17 @@ def test_memory_and_folders_give_the_same(folders: tuple[Path, Path]) -> None:
     names = ["000000", "000001", "000002"]
     memory = evaluate({name: [thing()] for name in names}, {name: [thing(score=0.5)] for name in names})
     assert memory == evaluate(*folders)
+
+
+def test_many_broken_lines_are_summed_up_and_named_as_the_cause(folders: tuple[Path, Path]) -> None:
+    for path in folders[1].iterdir():
+        path.write_text(LABEL + "\n" + LABEL)
+    evaluation = prepare(*folders, lenient=True, classes=["Car"])
+    report = evaluation.report()
+    assert report["skipped"] == {"broken line": 6}
+    assert report["warnings"][-1] == "broken line: 3 more were passed over"
+    assert sum("needs a score" in text for text in report["warnings"]) == 3
+    causes = likely_causes(evaluation.matcher, evaluation.targets[0])
+    assert len(causes) == 1
+    assert "no line of the result files could be used (6 broken)" in causes[0]
+    assert "needs a score in column 16" in causes[0]
