@@ -64,7 +64,7 @@ def _examine_sfd_rows(
     if not np.isfinite(rows).all():
         bad = int((~np.isfinite(rows)).any(axis=1).sum())
         return [Finding("non_finite_points", name, where, f"{bad} of {len(rows)} rows hold NaN or infinite values")]
-    wild = np.abs(rows[:, :3]).max(initial=0) > 1e4 or rows[:, 7:].min(initial=0) < -1 or np.any(rows[:, 3:6] < 0)
+    wild = np.abs(rows[:, :3]).max(initial=0) > 1e4 or rows[:, 7:].min(initial=0) < -1000 or np.any(rows[:, 3:6] < 0)
     if wild:
         return [Finding("wrong_columns", name, where, "columns are not x y z r g b seg u v in float32")]
     largest = float(rows[:, 3:6].max(initial=0))
