@@ -1,0 +1,149 @@
+"""The suite "real": completion on held-out rings and cars found, on the frames of a KITTI object folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from completion.infer import Completer, load_completer
+from detection.infer import load_detector
+from detection.kitti_format import KittiObject
+from detection.results import result_objects
+from detection.types import PointFrame
+from pipeline.benchmark.car_recall import CarReport, car_recall
+from pipeline.benchmark.held_out_rings import ROW_STEPS, hold_out, score
+from pipeline.benchmark.peers import PEERS
+from pipeline.data import Dataset, Frame
+from pipeline.pointcloud.augment import augment_frame
+from pipeline.pointcloud.presets import PRESETS
+from pipeline.runner.seeds import derive_seed
+from pipeline.simulation.lidar_rows import subsample_rows
+
+Progress = Callable[[str], None]
+IOUS = (0.5, 0.7)
+
+
+@dataclass(frozen=True)
+class DetectionRow:
+    """One detector on one kind of input.
+
+    rows    LiDAR rows given to completion and detector: 64 or 16
+    preset  "L" for raw LiDAR, else the preset of the augmented cloud
+    """
+
+    detector: str
+    preset: str
+    rows: int
+    threshold: float
+
+
+def completion_scores(
+    dataset: Dataset, names: Iterable[str], rows: Iterable[int], progress: Progress
+) -> list[dict[str, Any]]:
+    """Mean scores over frames, one entry per method and number of rows; see `held_out_rings.score` for the keys.
+
+    names  peers ("nearest", "linear_inverse"), "classical", or weights as `load_completer` takes them
+    """
+    methods = [(name, _method(name)) for name in names]
+    found: dict[tuple[str, int], list[dict[str, float]]] = {}
+    for frame_id in dataset.ids:
+        frame = dataset[frame_id]
+        for number in rows:
+            held_out = hold_out(frame.points, frame.calibration, frame.image_size, number)
+            for name, complete in methods:
+                start = time.perf_counter()
+                depth = complete(held_out.sparse, frame.image)
+                seconds = time.perf_counter() - start
+                found.setdefault((name, number), []).append(score(depth, held_out) | {"seconds": seconds})
+        progress(f"completion {frame_id}")
+    return [{"method": name, "rows": number} | _means(entries) for (name, number), entries in found.items()]
+
+
+def _method(name: str) -> Callable[[NDArray[np.float32], NDArray[np.uint8]], NDArray[np.float32]]:
+    if name in PEERS:
+        peer = PEERS[name]
+        return lambda sparse, image: peer(sparse)
+    completer: Completer = load_completer(name)
+    return lambda sparse, image: completer.complete(sparse, image).depth
+
+
+def _means(entries: list[dict[str, float]]) -> dict[str, Any]:
+    """Plain means over frames; NaN entries (too few clean windows) are left out, time by its median."""
+    means: dict[str, Any] = {"frames": len(entries)}
+    for key in entries[0]:
+        values = np.array([entry[key] for entry in entries])
+        usable = values[np.isfinite(values)]
+        summary = np.median if key == "seconds" else np.mean
+        means[key] = float(summary(usable)) if len(usable) else None
+    return means
+
+
+def detection_scores(dataset: Dataset, rows: Iterable[DetectionRow], completer: str, progress: Progress) -> list[Any]:
+    """Recall and precision of cars for every row, from above and in 3D at IoU 0.5 and 0.7."""
+    complete = load_completer(completer)
+    results = []
+    for row in rows:
+        detector = load_detector(row.detector, seed=0)
+        labels, detections = [], []
+        for frame_id in dataset.ids:
+            frame = dataset[frame_id]
+            cloud = PointFrame(
+                _cloud(frame, row, complete),
+                frame.calibration.T_cam_velo,
+                frame.calibration.P2,
+                frame.image_size,
+                frame.id,
+            )
+            labels.append(frame.labels)
+            detections.append(result_objects(detector.detect(cloud), cloud))
+            progress(f"{row.detector} {row.preset} {row.rows} rows {frame_id}")
+        results.append(asdict(row) | {"reports": _reports(labels, detections, row.threshold)})
+    return results
+
+
+def _cloud(frame: Frame, row: DetectionRow, complete: Completer) -> NDArray[np.float32]:
+    points = frame.points if row.rows == 64 else subsample_rows(frame.points, 64 // row.rows)
+    if row.preset == "L":
+        return points
+    from pipeline.data.projection import project_points
+
+    sparse = project_points(points, frame.calibration, frame.image_size)
+    completed = complete.complete(sparse, frame.image)
+    seed = derive_seed(0, frame.id, "augment")
+    return augment_frame(completed, points, frame.calibration, PRESETS[row.preset], None, seed).points
+
+
+def _reports(
+    labels: list[list[KittiObject]], detections: list[list[KittiObject]], threshold: float
+) -> list[dict[str, Any]]:
+    return [
+        _plain(car_recall(labels, detections, iou=iou, metric=metric, score_threshold=threshold))
+        for metric in ("bev", "3d")
+        for iou in IOUS
+    ]
+
+
+def _plain(report: CarReport) -> dict[str, Any]:
+    levels = {name: [value.found, value.total] for name, value in report.by_level.items()}
+    distances = {f"{a:g}-{b:g}": [value.found, value.total] for (a, b), value in report.by_distance.items()}
+    return {
+        "metric": report.metric,
+        "iou": report.iou,
+        "found": levels,
+        "found_by_distance": distances,
+        "precision": None if np.isnan(report.precision) else report.precision,
+        "false": report.false_detections,
+    }
+
+
+def row_numbers(text: str) -> list[int]:
+    """'32,16,8' -> [32, 16, 8]. ValueError for other numbers of rows."""
+    numbers = [int(part) for part in text.split(",") if part.strip().isdigit()]
+    if not numbers or any(number not in ROW_STEPS for number in numbers):
+        raise ValueError(f"rows: expected some of {', '.join(map(str, ROW_STEPS))}, got {text!r}")
+    return numbers

@@ -1,0 +1,115 @@
+"""`run_pipeline --stage bench`: accuracy on real frames without depth ground truth."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import UsageError
+
+COLUMNS = ("mae", "rmse", "tmae", "trmse", "mixed", "mixed_all", "edge_tmae", "missing", "seconds")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the verb."""
+    add = parser.add_argument
+    add("--suite", choices=("real",), default="real", help="real: held-out LiDAR rings and cars on KITTI frames")
+    add("--data", required=True, metavar="DIR", help="KITTI object folder (training/velodyne, image_2, calib, label_2)")
+    add("--frames", metavar="FILE|a:b|ids", help="split file, positions, or ids separated by commas")
+    add("--rows", default="32,16,8", metavar="N,N", help="LiDAR rows given to completion (default: 32,16,8)")
+    add("--completers", metavar="NAME,NAME", help="methods (default: peers, classical and all embedded networks)")
+    add("--detectors", metavar="NAME,NAME", help="detectors (default: all embedded); '' for none")
+    add("--threshold", type=float, metavar="S", help="lowest score that counts (default: the one in the card)")
+    add("--out", metavar="DIR", help="also write real.json and real.md there")
+    add("--json", action="store_true", help="print JSON instead of tables")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measures and prints; 0 when done."""
+    from pipeline.benchmark.suite import completion_scores, detection_scores, row_numbers
+    from pipeline.data import open_dataset
+
+    dataset = open_dataset("kitti_object", args.data)
+    if args.frames:
+        dataset = dataset.select(args.frames)
+    try:
+        rows = row_numbers(args.rows)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+
+    def progress(text: str) -> None:
+        print(f"  {text}", file=sys.stderr)
+
+    names = _completers(args.completers)
+    found: dict[str, Any] = {"frames": len(dataset), "completion": completion_scores(dataset, names, rows, progress)}
+    detectors = _detection_rows(args.detectors, args.threshold)
+    if detectors:
+        best = [name for name in names if name not in ("nearest", "linear_inverse", "classical")] or ["classical"]
+        found["detection"] = detection_scores(dataset, detectors, best[-1], progress)
+    tables = _tables(found)
+    print(json.dumps(found, indent=1) if args.json else tables)
+    if args.out:
+        folder = Path(args.out)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "real.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
+        (folder / "real.md").write_text(tables, encoding="utf-8")
+    return 0
+
+
+def _completers(chosen: str | None) -> list[str]:
+    from pipeline.weights import embedded_names
+
+    if chosen is not None:
+        return [name for name in chosen.split(",") if name]
+    return ["nearest", "linear_inverse", "classical", *embedded_names("completion")]
+
+
+def _detection_rows(chosen: str | None, threshold: float | None) -> list[Any]:
+    """Every detector on the clouds it was trained for, at 64 and at 16 rows."""
+    from detection.checkpoints import find_weights, read_card
+    from pipeline.benchmark.suite import DetectionRow
+    from pipeline.weights import embedded_names
+
+    names = embedded_names("detection") if chosen is None else [name for name in chosen.split(",") if name]
+    rows = []
+    for name in names:
+        card = read_card(find_weights(name))
+        preset = str(card.get("cloud", "L"))
+        score = float(card.get("score_threshold", 0.0)) if threshold is None else threshold
+        rows += [DetectionRow(name, preset, number, score) for number in (64, 16)]
+    return rows
+
+
+def _tables(found: dict[str, Any]) -> str:
+    """Both results as Markdown."""
+    lines = [f"Completion on held-out rings, {found['frames']} frames (mm; %; s per frame)", ""]
+    lines += ["| rows | method | " + " | ".join(COLUMNS) + " |", "|" + "---|" * (len(COLUMNS) + 2)]
+    for entry in sorted(found["completion"], key=lambda e: -e["rows"]):
+        numbers = [
+            _number(entry[key], 3 if key == "seconds" else (0 if "ae" in key or "rmse" in key else 1))
+            for key in COLUMNS
+        ]
+        lines.append(f"| {entry['rows']} | {entry['method']} | " + " | ".join(numbers) + " |")
+    if "detection" in found:
+        lines += ["", f"Cars found, {found['frames']} frames (found/labelled; precision)", ""]
+        lines += [
+            "| detector | cloud | rows | overlap | easy | moderate | hard | precision | false |",
+            "|" + "---|" * 9,
+        ]
+        for entry in found["detection"]:
+            for report in entry["reports"]:
+                counts = [f"{hit}/{total}" for hit, total in report["found"].values()]
+                lines.append(
+                    f"| {entry['detector']} | {entry['preset']} | {entry['rows']} | "
+                    f"{report['metric']} {report['iou']:g} | "
+                    + " | ".join(counts)
+                    + f" | {_number(report['precision'], 2)} | {report['false']} |"
+                )
+    return "\n".join(lines) + "\n"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
