@@ -11,7 +11,7 @@ from pipeline.data.projection import project_points
 from pipeline.simulation.lidar import MAX_RANGE, beam_directions, scan, sensor
 from pipeline.simulation.lidar_rows import split_rings, subsample_rows
 from pipeline.simulation.scenes import surfaces as S
-from pipeline.simulation.scenes.mesh import assemble, box, cylinder
+from pipeline.simulation.scenes.mesh import assemble, cylinder, quad
 from pipeline.simulation.scenes.surfaces import CAR, GLASS_CAR, Surface, Texture
 from pipeline.simulation.synth import SyntheticFrame
 from pipeline.simulation.tracing import Tracer
@@ -80,7 +80,7 @@ def test_nothing_returns_from_beyond_80_m() -> None:
 
 
 def test_glass_lets_pulses_through() -> None:
-    pane = box(0.02, 6.0, 6.0, GLASS_CAR, -3.0).at(5.0, 0.0)
+    pane = quad([(5, -3, -3), (5, 3, -3), (5, 3, 3), (5, -3, 3)], GLASS_CAR)
     tracer = Tracer(assemble([(0, [*_drum(15.0, WHITE), pane])]))  # type: ignore[list-item]
     points = scan(tracer, sensor(64), IDENTITY, np.random.default_rng(2))
     behind = (points[:, 0] > 3) & (np.abs(points[:, 1]) < 0.3 * points[:, 0]) & (np.abs(points[:, 2]) < 2)
