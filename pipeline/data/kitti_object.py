@@ -8,9 +8,10 @@ Cityscapes trainIds) and `instance_2` (uint16, 0 = none); they are read when pre
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,19 +67,19 @@ def _files(folder: Path) -> Iterable[Path]:
 def open_frame(folder: Path, frame_id: str) -> Frame:
     """One frame of a training/ or testing/ folder; nothing is read yet."""
     image = image_path(folder, frame_id)
-    loaders = {
+    loaders: dict[str, Callable[[], Any]] = {
         "image": partial(read_image, image),
         "image_size": partial(image_size, image),
         "points": partial(read_velodyne, folder / "velodyne" / f"{frame_id}.bin"),
         "calibration": partial(read_calibration, folder / "calib" / f"{frame_id}.txt"),
     }
-    optional = {
-        "labels": partial(read_labels, folder / "label_2" / f"{frame_id}.txt"),
-        "target_depth": partial(read_depth_png, folder / "depth_2" / f"{frame_id}.png"),
-        "semantics": partial(read_semantics, folder / "semantic_2" / f"{frame_id}.png"),
-        "instances": partial(read_instances, folder / "instance_2" / f"{frame_id}.png"),
+    optional: dict[str, tuple[Callable[[Path], Any], Path]] = {
+        "labels": (read_labels, folder / "label_2" / f"{frame_id}.txt"),
+        "target_depth": (read_depth_png, folder / "depth_2" / f"{frame_id}.png"),
+        "semantics": (read_semantics, folder / "semantic_2" / f"{frame_id}.png"),
+        "instances": (read_instances, folder / "instance_2" / f"{frame_id}.png"),
     }
-    loaders.update({part: loader for part, loader in optional.items() if loader.args[0].is_file()})
+    loaders.update({part: partial(read, path) for part, (read, path) in optional.items() if path.is_file()})
     return Frame(frame_id, loaders, str(folder))
 
 
