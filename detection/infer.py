@@ -12,11 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from detection.boxes import wrap_angle
-from detection.checkpoints import load_checkpoint
-from detection.inputs import CameraCloud, camera_cloud, ground_height, mirrored, network_input
+from detection.boxes import from_lidar, wrap_angle
+from detection.checkpoints import import_checkpoint, load_checkpoint
+from detection.inputs import CameraCloud, camera_cloud, ground_height, lidar_input, mirrored, network_input
 from detection.models.batch import DetectorModel, PointBatch, RawDetections
-from detection.models.presets import OutputSettings, Preset
+from detection.models.presets import IMPORTED_PRESETS, OutputSettings, Preset
 from detection.ops import iou_bev, nms_rotated
 from detection.types import Boxes3D, Detections, PointFrame
 
@@ -39,6 +39,8 @@ class Detector:
         Only points inside the image and the detection range count; without any, nothing is found.
         Raises ValueError when the frame lacks a column the network was trained with.
         """
+        if self.preset.inputs.frame == "lidar":
+            return self._detect_in_lidar_frame(frame)
         cloud = camera_cloud(frame)
         if not len(cloud.xyz):
             return Detections.empty()
@@ -47,17 +49,31 @@ class Detector:
             found.append(_mirror_back(self._pass(mirrored(cloud), frame.id, "mirrored")))
         return final_detections(found, self.preset.outputs, self.preset.classes)
 
-    def _pass(self, cloud: CameraCloud, frame_id: str, name: str) -> RawDetections:
+    def _generator(self, frame_id: str, name: str) -> np.random.Generator:
         digest = hashlib.sha256(f"{frame_id}/{name}".encode()).digest()
-        rng = np.random.default_rng([self.seed, int.from_bytes(digest[:8], "little")])
-        points, full = network_input(cloud, ground_height(cloud.xyz), self.preset.inputs, rng)
+        return np.random.default_rng([self.seed, int.from_bytes(digest[:8], "little")])
 
+    def _pass(self, cloud: CameraCloud, frame_id: str, name: str) -> RawDetections:
+        rng = self._generator(frame_id, name)
+        points, full = network_input(cloud, ground_height(cloud.xyz), self.preset.inputs, rng)
+        return self._run(points, full)
+
+    def _run(self, points: NDArray[np.float32], full: NDArray[np.float32]) -> RawDetections:
         def on_device(values: NDArray[Any]) -> Tensor:
             return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
 
         batch = PointBatch(on_device(points)[None], [on_device(full)], [], [])
         with torch.inference_mode():
             return cast(DetectorModel, self.model).raw_detections(batch)[0]
+
+    def _detect_in_lidar_frame(self, frame: PointFrame) -> Detections:
+        points = lidar_input(frame, self.preset.inputs.points, self._generator(frame.id, "straight"))
+        if not len(points):
+            return Detections.empty()
+        raw = self._run(points, points[:0])
+        boxes = from_lidar(raw.boxes.double().cpu().numpy(), frame.T_cam_velo)
+        camera = RawDetections(torch.from_numpy(boxes.values), raw.logits, raw.classes)
+        return final_detections([camera], self.preset.outputs, self.preset.classes)
 
 
 def load_detector(path_or_name: str | Path, device: str = "cpu", seed: int = 0) -> Detector:
@@ -69,6 +85,18 @@ def load_detector(path_or_name: str | Path, device: str = "cpu", seed: int = 0) 
     return Detector(model, preset, torch.device(device), seed)
 
 
+def imported_detector(path: str | Path, architecture: str, device: str = "cpu", seed: int = 0) -> Detector:
+    """A detector from a public checkpoint; architectures as `detection.checkpoints.import_checkpoint`.
+
+    Raises ValueError when the file does not fit, or the architecture has no detector here.
+    """
+    model = import_checkpoint(path, architecture)
+    if architecture not in IMPORTED_PRESETS:
+        raise ValueError(f"no detector for {architecture!r}; there are {', '.join(IMPORTED_PRESETS)}")
+    preset = IMPORTED_PRESETS[architecture](model)
+    return Detector(model.to(torch.device(device)), preset, torch.device(device), seed)
+
+
 def _mirror_back(raw: RawDetections) -> RawDetections:
     """Boxes found in a cloud with x reversed, in the original scene."""
     x, *rest, ry = raw.boxes.unbind(1)
@@ -76,37 +104,30 @@ def _mirror_back(raw: RawDetections) -> RawDetections:
 
 
 def final_detections(found: list[RawDetections], settings: OutputSettings, classes: tuple[str, ...]) -> Detections:
-    """Threshold, rotated NMS per class and, where asked for, box voting over all passes."""
+    """Threshold, rotated NMS and, where asked for, box voting over all passes; best score first."""
     boxes = torch.cat([raw.boxes for raw in found]).double().cpu()
     logits = torch.cat([raw.logits for raw in found]).double().cpu()
     labels = torch.cat([raw.classes for raw in found]).cpu()
     usable = (logits.sigmoid() > settings.score_threshold) & (boxes[:, 3:6] > 0).all(dim=1)
     usable &= torch.isfinite(boxes).all(dim=1)
     boxes, logits, labels = boxes[usable], logits[usable], labels[usable]
-    parts = []
-    for index, name in enumerate(classes):
-        of_class = labels == index
-        kept, scores = _suppress(boxes[of_class], logits[of_class], settings)
-        values = kept.numpy().copy()
-        values[:, 6] = wrap_angle(values[:, 6])
-        parts.append(Detections(Boxes3D(values), (name,) * len(values), scores.numpy()))
-    merged = Detections(
-        Boxes3D(np.concatenate([part.boxes.values for part in parts])),
-        tuple(name for part in parts for name in part.classes),
-        np.concatenate([part.scores for part in parts]),
-    )
-    return merged.select(np.argsort(-merged.scores, kind="stable"))
-
-
-def _suppress(boxes: Tensor, logits: Tensor, settings: OutputSettings) -> tuple[Tensor, Tensor]:
-    """Kept boxes (K, 7) of one class, voted where asked for, and their scores (K,)."""
-    scores = logits.sigmoid() if settings.probability else logits
-    if not len(boxes):
-        return boxes, scores
-    kept = nms_rotated(boxes, logits, settings.nms_iou)
+    groups = [labels == index for index in range(len(classes))] if settings.nms_per_class else [labels >= 0]
+    kept = torch.cat([_kept(boxes, logits, group, settings.nms_iou) for group in groups])
+    kept = kept[logits[kept].argsort(descending=True, stable=True)]
+    values = boxes[kept].numpy().copy()
     if settings.vote_iou < 1:
-        return vote(boxes[kept], boxes, logits.sigmoid(), settings.vote_iou), scores[kept]
-    return boxes[kept], scores[kept]
+        for index in range(len(classes)):
+            rows, of_class = (labels[kept] == index).numpy(), labels == index
+            values[rows] = vote(boxes[kept][rows], boxes[of_class], logits[of_class].sigmoid(), settings.vote_iou)
+    values[:, 6] = wrap_angle(values[:, 6])
+    scores = logits[kept].sigmoid() if settings.probability else logits[kept]
+    return Detections(Boxes3D(values), tuple(classes[index] for index in labels[kept].tolist()), scores.numpy())
+
+
+def _kept(boxes: Tensor, logits: Tensor, group: Tensor, iou: float) -> Tensor:
+    """Indices of the boxes of a group (P,) bool that survive rotated NMS."""
+    index = group.nonzero().squeeze(1)
+    return index[nms_rotated(boxes[index], logits[index], iou)]
 
 
 def vote(kept: Tensor, boxes: Tensor, weights: Tensor, iou: float) -> Tensor:

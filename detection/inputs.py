@@ -40,15 +40,9 @@ def camera_cloud(frame: PointFrame) -> CameraCloud:
     """Points inside the image (of this frame's own size), in front of the camera and within `AREA`."""
     velo = frame.points[:, :3].astype(np.float64)
     xyz = velo @ frame.T_cam_velo[:3, :3].T + frame.T_cam_velo[:3, 3]
-    projected = xyz @ frame.P2[:, :3].T + frame.P2[:, 3]
-    inside = projected[:, 2] - frame.P2[2, 3] >= 0
+    inside = in_image(frame)
     for axis, (low, high) in enumerate(AREA):
         inside &= (xyz[:, axis] >= low) & (xyz[:, axis] <= high)
-    height, width = frame.image_size
-    # PointRCNN divides by z of the rectified frame, not by the homogeneous coordinate.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = projected[:, 0] / xyz[:, 2], projected[:, 1] / xyz[:, 2]
-        inside &= (u >= 0) & (u < width) & (v >= 0) & (v < height)
     return CameraCloud(xyz[inside].astype(np.float32), frame.points[inside, 3:])
 
 
@@ -178,3 +172,37 @@ def network_input(
 def mirrored(cloud: CameraCloud) -> CameraCloud:
     """The cloud reflected in the plane x = 0."""
     return CameraCloud(cloud.xyz * np.array([-1, 1, 1], dtype=np.float32), cloud.columns)
+
+
+def in_image(frame: PointFrame) -> NDArray[np.bool_]:
+    """(N,) whether a point is in front of the camera and inside the image."""
+    xyz = frame.points[:, :3].astype(np.float64) @ frame.T_cam_velo[:3, :3].T + frame.T_cam_velo[:3, 3]
+    projected = xyz @ frame.P2[:, :3].T + frame.P2[:, 3]
+    height, width = frame.image_size
+    # PointRCNN and OpenPCDet divide by z of the rectified frame, not by the homogeneous coordinate.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = projected[:, 0] / xyz[:, 2], projected[:, 1] / xyz[:, 2]
+        return (projected[:, 2] - frame.P2[2, 3] >= 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+
+
+# OpenPCDet's POINT_CLOUD_RANGE of x and y; its mask leaves z alone.
+LIDAR_AREA = ((0.0, 70.4), (-40.0, 40.0))
+
+
+def lidar_input(frame: PointFrame, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
+    """(count, 4) x y z intensity in the LiDAR frame as OpenPCDet's KITTI models take them; (0, 4) when none is visible.
+
+    Inside the image and `LIDAR_AREA`; near and far are told apart by the 3D distance (40 m); raw reflectance.
+    """
+    points = frame.points[:, :4]
+    if points.shape[1] < 4:
+        raise ValueError(f"{frame.id}: expected points x y z intensity, got {points.shape[1]} columns")
+    keep = in_image(frame)
+    for axis, (low, high) in enumerate(LIDAR_AREA):
+        keep &= (points[:, axis] >= low) & (points[:, axis] <= high)
+    points = points[keep]
+    if not len(points):
+        return points
+    distance = np.linalg.norm(points[:, :3], axis=1)
+    ranked = np.column_stack([points[:, :2], distance])
+    return points[sampling.near_far_sample(ranked, count, rng)]

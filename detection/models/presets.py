@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 from torch import nn
 
 from detection.inputs import InputSettings
 from detection.models.compact import CLASSES, CompactPointRCNN, CompactSettings
+from detection.models.openpcdet_pointrcnn import OpenPCDetPointRCNN
 from detection.models.pointrcnn import PointRCNN, PointRCNNSettings
 from detection.models.proposals import ProposalSettings
 from detection.targets import RoiSamplingSettings
@@ -24,7 +25,8 @@ class OutputSettings:
     """From refined boxes to detections.
 
     score_threshold  on the sigmoid of the score
-    nms_iou          rotated BEV IoU above which the lower score is suppressed, per class
+    nms_iou          rotated BEV IoU above which the lower score is suppressed
+    nms_per_class    only within a class; else over all boxes (OpenPCDet)
     probability      detections carry the sigmoid; else the raw logit, as the reference's result files do
     mirrored_pass    detect on the mirrored cloud as well and pool the boxes
     vote_iou         boxes of a class that overlap a kept one by more are averaged with it by score; 1 = no voting
@@ -35,6 +37,7 @@ class OutputSettings:
     probability: bool = False
     mirrored_pass: bool = False
     vote_iou: float = 1.0
+    nms_per_class: bool = True
 
 
 @dataclass(frozen=True)
@@ -148,4 +151,29 @@ PRESETS: dict[str, Callable[..., Preset]] = {
     "pointrcnn": pointrcnn,
     "pointrcnn2": pointrcnn2,
     "thesis": thesis,
+}
+
+
+def _fitting_pointrcnn(model: nn.Module) -> Preset:
+    features = ("intensity",) * cast(PointRCNN, model).settings.extra_channels
+    return pointrcnn(cast(PointRCNN, model).settings.fine_location, features)
+
+
+def _fitting_epnet(model: nn.Module) -> Preset:
+    settings = cast(PointRCNN, model).settings
+    return pointrcnn2(("intensity",) * settings.extra_channels, settings.iou_branch)
+
+
+def _openpcdet_pointrcnn(model: nn.Module) -> Preset:
+    inputs = InputSettings(16384, frame="lidar", features=("intensity",))
+    return Preset(
+        "openpcdet_pointrcnn", CLASSES, inputs, OutputSettings(0.1, 0.1, nms_per_class=False), OpenPCDetPointRCNN
+    )
+
+
+# Architecture of an imported checkpoint -> the preset that runs its network.
+IMPORTED_PRESETS: dict[str, Callable[[nn.Module], Preset]] = {
+    "pointrcnn": _fitting_pointrcnn,
+    "epnet": _fitting_epnet,
+    "openpcdet_pointrcnn": _openpcdet_pointrcnn,
 }

@@ -30,12 +30,12 @@ def surface_points(box: NDArray[np.float64], count: int, rng: np.random.Generato
 
 
 def place_cars(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """(count, 7) boxes of car size, 8 to 35 m ahead, at least 7 m apart, in view of the camera."""
+    """(count, 7) boxes of car size, 8 to 25 m ahead, at least 6 m apart, in view of the camera."""
     boxes: list[NDArray[np.float64]] = []
     while len(boxes) < count:
-        z = rng.uniform(8, 35)
+        z = rng.uniform(8, 25)
         x = rng.uniform(-0.6, 0.6) * z
-        if all(np.hypot(x - other[0], z - other[2]) > 7 for other in boxes):
+        if all(np.hypot(x - other[0], z - other[2]) > 6 for other in boxes):
             size = np.array([1.53, 1.63, 3.9]) * rng.uniform(0.9, 1.1)
             boxes.append(np.array([x, GROUND_Y, z, *size, rng.uniform(-np.pi, np.pi)]))
     return np.array(boxes)

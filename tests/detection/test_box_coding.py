@@ -40,7 +40,7 @@ def test_location_targets_by_hand() -> None:
 
 
 def test_heading_targets_by_hand() -> None:
-    # Full circle, 30 degrees per bin, bin 0 centred on 0: 40 degrees -> bin 1 (15..45), 10 of 15 degrees above its centre.
+    # Full circle, 30 degrees per bin, bin 0 about 0: 40 degrees -> bin 1 (15..45), 10 of 15 degrees off its centre.
     degrees = torch.tensor([40.0, -10.0, 180.0], dtype=torch.float64)
     index, residual = rpn_coder().encode_heading(degrees.deg2rad())
     assert index.tolist() == [1, 0, 6]

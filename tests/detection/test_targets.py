@@ -118,7 +118,7 @@ def test_ground_truth_as_proposals_returns_through_the_second_stage(rng) -> None
     code = coder.perfect_code(coder.encode(local[:, :3], local[:, 3:6], local[:, 6], mean))
     refined = boxes_from_rois(rois, code, coder, mean, soft=False)
     overlap = torch.as_tensor(iou_3d_aligned(refined, boxes))
-    # Clamping (1 mm of bins, 1 mrad of heading) is all that may be lost; a heading off by more than 45 degrees is folded.
+    # Clamping (1 mm of bins, 1 mrad of heading) is all that may be lost; headings off by over 45 degrees are folded.
     within = (refined[:, 6] - boxes[:, 6]).sin().abs() < 0.01
     assert within.double().mean() > 0.95
     assert overlap[within].min() > 0.99
