@@ -147,7 +147,7 @@ def _power(
     (KITTI's roads answer beyond 50 m, at cosines of 0.03).
     """
     distance = np.where(np.isfinite(reach), np.maximum(reach, 1.0), np.inf)
-    return np.asarray(reflectance * np.where(polished, cosine**1.3, cosine**0.3) / 0.1 * (50.0 / distance) ** 2)
+    return np.asarray(reflectance * np.where(polished, 0.6 * cosine**1.3, cosine**0.3) / 0.1 * (50.0 / distance) ** 2)
 
 
 def _detected(power: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.bool_]:

@@ -76,7 +76,7 @@ def draw_light(rng: np.random.Generator) -> Light:
         sky=blue if sunny else (0.85, 0.88, 0.92),
         horizon=(0.85, 0.92, 1.0) if sunny else (0.95, 0.97, 1.0),
         clouds=float(rng.uniform(0, 0.8)) if sunny else 0.95,
-        exposure=float(rng.normal(-0.1, 0.45)),
+        exposure=float(np.clip(rng.normal(-0.05, 0.4), -0.7, 0.9)),
         tint=(float(rng.normal(1.0, 0.04)), float(rng.normal(1.0, 0.05))),
     )
 
