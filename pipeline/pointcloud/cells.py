@@ -73,14 +73,15 @@ class CellBuilder:
     def add(self, block: NDArray[np.float32], first: int, kept: NDArray[np.bool_]) -> tuple[int, int]:
         """Number the next (3, n) block, whose points are `first` and the following; gives its range of runs.
 
-        Points that `kept` (of all points) does not mark are left out. Raises ValueError for a kept point without cell.
+        Points that `kept` (of all points) does not mark are left out. Raises ValueError for a point without a cell.
         """
         begin, width = self.runs, block.shape[1]
+        # Written so that NaN, which makes both extremes NaN, fails too.
+        if width and not max(float(block.max()), -float(block.min())) * self.inverse_size < CELL_LIMIT:
+            self._refuse(bool(np.isfinite(block).all()))
         # One entry more than points: the last run ends where the key -2 follows, which no point has.
         keys, run_key = np.full(width + 1, -2, np.int64), np.empty(width, np.int64)
         runs = _cut_into_runs(block, first, kept, self.inverse_size, keys, run_key, self.run_start[begin:])
-        if runs < 0:
-            self._refuse(bool(np.isfinite(block).all()))
         self.runs += runs
         self._number(run_key[:runs], self.run_cell[begin : self.runs])
         return begin, self.runs
@@ -149,17 +150,12 @@ def _slot(key, capacity):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _cut_into_runs(block, first, kept, inverse_size, keys, run_key, run_start):  # type: ignore[no-untyped-def]
-    """Keys of a block's runs (-1: left out) and where they start; how many, or -1 when a kept point has no cell."""
-    count, wrong, runs = block.shape[1], 0, 0
+    """Keys of a block's runs (-1: left out) and where they start; returns how many there are."""
+    count, runs = block.shape[1], 0
     for i in range(count):
         x, y, z = block[0, i] * inverse_size, block[1, i] * inverse_size, block[2, i] * inverse_size
         key = _pack(np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(z)))
-        keys[i] = key if kept[first + i] else np.int64(-1)
-        # Written so that NaN fails too.
-        has_cell = (abs(x) < CELL_LIMIT) & (abs(y) < CELL_LIMIT) & (abs(z) < CELL_LIMIT)
-        wrong += np.int64(kept[first + i]) & (1 - np.int64(has_cell))
-    if wrong:
-        return -1
+        keys[i] = key | (np.int64(kept[first + i]) - 1)  # all bits set, so -1, when left out
     for i in range(count):
         # Written at every point; the place moves on only where the next key differs (no branches).
         run_key[runs] = keys[i]
