@@ -10,10 +10,11 @@ import json
 import os
 import sqlite3
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import quote
 
 from pipeline.errors import UsageError
 from pipeline.frame_files import Written, content_hash
@@ -41,31 +42,38 @@ class Row:
 
 
 class Ledger:
-    """The ledger of this process, and what the other shards' ledgers of the same run said when it was opened."""
+    """The ledger of this process, and the ledgers of the run's other shards to read.
+
+    Rows are looked up in the files when they are asked for: memory does not grow with the number of frames.
+    """
 
     def __init__(self, path: Path, others: Iterable[Path] = ()) -> None:
         """Raises UsageError when the folder cannot be written or a ledger is damaged."""
         self.path = path
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._connection = sqlite3.connect(path, timeout=60)
-            self._connection.execute("PRAGMA synchronous = FULL")
-            self._connection.executescript(_SCHEMA)
-            self._done = _rows(self._connection)
         except OSError as error:
             raise UsageError(f"{path.parent}: cannot be written: {error.strerror}") from None
-        except sqlite3.DatabaseError as error:
-            raise UsageError(f"{path}: {error}; {_hint(error)}") from None
-        self._others = _read_others([other for other in others if other != path])
+        self._connection = _opened(path, f"file:{quote(str(path.resolve()))}")
+        self._readers = [self._connection]
+        # Not mode=ro: after a crash of its owner SQLite may have to roll back the last transaction before reading.
+        self._readers += [
+            _opened(other, f"file:{quote(str(other.resolve()))}?mode=rw") for other in others if other != path
+        ]
 
     def close(self) -> None:
-        """Closes the file."""
-        self._connection.close()
+        """Closes the files."""
+        for connection in self._readers:
+            connection.close()
 
     def row(self, stage: str, frame: str) -> Row | None:
         """The last time this task was finished, by any shard."""
-        rows = [rows[stage, frame] for rows in (self._done, self._others) if (stage, frame) in rows]
-        return max(rows, key=lambda row: row.finished_at, default=None)
+        query = "SELECT key, written, seconds, finished_at FROM done WHERE stage = ? AND frame = ?"
+        found = [row for reader in self._readers for row in reader.execute(query, (stage, frame))]
+        if not found:
+            return None
+        key, written, seconds, finished_at = max(found, key=lambda row: row[3])
+        return Row(key, {name: Written(*file) for name, file in json.loads(written).items()}, seconds, finished_at)
 
     def record(self, outcome: Outcome, key: str) -> None:
         """Writes what became of a task; durable when the call returns."""
@@ -75,12 +83,10 @@ class Ledger:
                 text = json.dumps(outcome.failure.as_dict())
                 self._connection.execute("REPLACE INTO failed VALUES (?, ?, ?)", (stage, frame, text))
                 return
-            row = Row(key, outcome.written, outcome.seconds, time.time())
-            written = json.dumps({name: [file.size, file.hash] for name, file in row.written.items()})
-            values = (stage, frame, key, written, row.seconds, row.finished_at)
+            written = json.dumps({name: [file.size, file.hash] for name, file in outcome.written.items()})
+            values = (stage, frame, key, written, outcome.seconds, time.time())
             self._connection.execute("REPLACE INTO done VALUES (?, ?, ?, ?, ?, ?)", values)
             self._connection.execute("DELETE FROM failed WHERE stage = ? AND frame = ?", (stage, frame))
-        self._done[stage, frame] = row
 
     def forget_failures(self, stage: str, frames: Iterable[str]) -> None:
         """Removes noted failures of tasks that are about to be tried again or are no longer asked for."""
@@ -119,45 +125,31 @@ class Ledger:
         return value
 
     def mean_seconds(self, stage: str) -> float | None:
-        """Mean measured seconds per frame of a stage, or None."""
-        seconds = [row.seconds for (name, _), row in {**self._others, **self._done}.items() if name == stage]
-        return sum(seconds) / len(seconds) if seconds else None
+        """Mean measured seconds per frame of a stage over all shards, or None."""
+        query = "SELECT COUNT(*), TOTAL(seconds) FROM done WHERE stage = ?"
+        found = [row for reader in self._readers for row in reader.execute(query, (stage,))]
+        count = sum(row[0] for row in found)
+        return sum(row[1] for row in found) / count if count else None
 
 
 def all_failures(ledgers: Iterable[Path]) -> list[Failure]:
     """The failures of all shards of a run, sorted."""
     found: list[Failure] = []
     for path in ledgers:
-        with closing(_open_to_read(path)) as connection:
+        with closing(_opened(path, f"file:{quote(str(path.resolve()))}?mode=rw")) as connection:
             found += _failures(connection)
     return sorted(found, key=lambda failure: (failure.stage, failure.frame))
 
 
-def _open_to_read(path: Path) -> sqlite3.Connection:
-    # Not mode=ro: after a crash of its owner SQLite may have to roll the last transaction back before it can be read.
-    return sqlite3.connect(f"{path.resolve().as_uri()}?mode=rw", uri=True, timeout=60)
-
-
-def _read_others(paths: Iterable[Path]) -> dict[tuple[str, str], Row]:
-    """The finished tasks of other shards, the latest of each."""
-    found: dict[tuple[str, str], Row] = {}
-    for path in paths:
-        try:
-            with closing(_open_to_read(path)) as connection:
-                for task, row in _rows(connection).items():
-                    if task not in found or found[task].finished_at < row.finished_at:
-                        found[task] = row
-        except sqlite3.DatabaseError as error:
-            raise UsageError(f"{path}: {error}; {_hint(error)}") from None
-    return found
-
-
-def _rows(connection: sqlite3.Connection) -> dict[tuple[str, str], Row]:
-    rows: Mapping[tuple[str, str], Row] = {
-        (stage, frame): Row(key, {name: Written(*file) for name, file in json.loads(written).items()}, seconds, at)
-        for stage, frame, key, written, seconds, at in connection.execute("SELECT * FROM done")
-    }
-    return dict(rows)
+def _opened(path: Path, uri: str) -> sqlite3.Connection:
+    """A connection to a ledger with its tables. Raises UsageError when it cannot be used."""
+    try:
+        connection = sqlite3.connect(uri, uri=True, timeout=60)
+        connection.execute("PRAGMA synchronous = FULL")
+        connection.executescript(_SCHEMA)
+    except sqlite3.DatabaseError as error:
+        raise UsageError(f"{path}: {error}; {_hint(error)}") from None
+    return connection
 
 
 def _failures(connection: sqlite3.Connection) -> list[Failure]:
