@@ -9,16 +9,18 @@ from torch import Tensor
 
 from completion import losses
 from completion.depth_coefficients import Bins, cross_entropy
+from completion.mixture import expected_depth, negative_log_likelihood
 from completion.models import ModelSpec
 
-OBJECTIVES = ("twin", "l1", "l2", "l1_l2", "huber", "dc")
+OBJECTIVES = ("twin", "l1", "l2", "l1_l2", "huber", "dc", "mixture")
 
 
 @dataclass(frozen=True)
 class Objective:
     """What is minimised. The defaults are the published TWISE; everything after `target_pooling` is ours.
 
-    kind             "twin", "l1", "l2", "l1_l2", "huber" or "dc" (cross-entropy of Depth Coefficients)
+    kind             "twin", "l1", "l2", "l1_l2", "huber", "dc" (cross-entropy of Depth Coefficients)
+                     or "mixture" (likelihood)
     gamma            asymmetry of the twin-surface loss
     detach_surfaces  the fusion term trains sigma alone
     target_pooling   reduction of the target for outputs of lower resolution (`losses.POOLING_RULES`)
@@ -55,10 +57,17 @@ class Objective:
             )
 
 
+def default_kind(spec: ModelSpec) -> str:
+    """What a network with this output is usually trained by."""
+    return {"twin": "twin", "coefficients": "dc", "mixture": "mixture", "depth": "l2"}[spec.output]
+
+
 def fits(objective: Objective, spec: ModelSpec) -> None:
     """ValueError when a network with this output cannot be trained by this objective."""
-    needed = {"twin": "twin", "dc": "coefficients"}.get(objective.kind, "depth")
-    if spec.output != needed:
+    needed = {"twin": "twin", "dc": "coefficients", "mixture": "mixture"}.get(objective.kind, "depth")
+    # A mixture has an expected depth, so that the same network can be trained by a loss on one depth.
+    offered = (spec.output, "depth") if spec.output == "mixture" else (spec.output,)
+    if needed not in offered:
         raise ValueError(
             f"objective {objective.kind!r} needs a network with output {needed!r}, "
             f"{spec.architecture} gives {spec.output!r}"
@@ -117,6 +126,10 @@ def _parts(
     output: Tensor, target: Tensor, weights: Tensor, spec: ModelSpec, objective: Objective, progress: float
 ) -> dict[str, Tensor]:
     """Loss parts of one output; target in the network's unit."""
+    if objective.kind == "mixture":
+        return {"loss": losses.masked_mean(negative_log_likelihood(output, target), weights)}
+    if spec.output == "mixture":
+        output = expected_depth(output)
     if objective.kind != "twin":
         return {"loss": losses.DEPTH_LOSSES[objective.kind](output, target, weights)}
     twin = losses.twin_loss(output, target, weights, objective.gamma, objective.detach_surfaces)

@@ -91,6 +91,10 @@ class TrainConfig(LibrarySection):
     """Training; other keys: the `TrainSettings` of the network's library."""
 
     network: Literal["completion", "detection"] = "completion"
+    # Completion only: every n-th LiDAR ring with n drawn from these, e.g. [1, 2, 4, 8]; none: the frame's sparse map.
+    row_steps: tuple[int, ...] = ()
+    # With row_steps: standard deviation in degrees of a random rotation between LiDAR and camera.
+    calibration_jitter: float = 0.0
 
 
 class RunConfig(Section):

@@ -6,16 +6,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pipeline.config import Config
-from pipeline.data import Dataset
+from pipeline.data import Dataset, Frame
 from pipeline.errors import DataError, UsageError
 from pipeline.frame_files import FrameFiles
 from pipeline.paths import RunFolder
+from pipeline.row_drawing import RowDrawing
 from pipeline.settings import plain, with_changes
 from pipeline.stages import cloud_of, open_frames
 from pipeline.versions import made_with
 
 if TYPE_CHECKING:
+    from completion.samples import TrainingSample
     from completion.types import DepthFrame
     from detection.kitti_format import KittiObject
     from detection.types import PointFrame
@@ -26,16 +30,22 @@ class DepthSamples:
     """Frames with true depth, as `completion.train` reads them; picklable for its worker processes."""
 
     dataset: Dataset
+    row_steps: tuple[int, ...] = ()
+    calibration_jitter: float = 0.0
 
     def __len__(self) -> int:
         return len(self.dataset)
 
-    def __getitem__(self, index: int, /) -> DepthFrame:
+    def __getitem__(self, index: int, /) -> DepthFrame | TrainingSample:
+        from completion.samples import TrainingSample
         from completion.types import DepthFrame
 
         frame = self.dataset[index]
         camera = frame.calibration.K if frame.has("calibration") else None
-        return DepthFrame(frame.image, frame.sparse_depth, frame.target_depth, camera)
+        sample = DepthFrame(frame.image, frame.sparse_depth, frame.target_depth, camera)
+        if not self.row_steps:
+            return sample
+        return TrainingSample(sample, RowDrawing.of(frame, self.row_steps, self.calibration_jitter))
 
 
 @dataclass(frozen=True)
@@ -76,6 +86,7 @@ def train_stage(config: Config, run: RunFolder) -> Path:
 def train_completion(config: Config, dataset: Dataset, out: Path) -> Path:
     """`completion.train` on frames with true depth; the run's seed unless the section has its own."""
     from completion.models import default_spec
+    from completion.objectives import Objective, default_kind
     from completion.train import TrainSettings, train
 
     if not dataset[0].has("target_depth"):
@@ -83,9 +94,22 @@ def train_completion(config: Config, dataset: Dataset, out: Path) -> Path:
     changes = config.train.library
     # Another architecture brings its own input scaling, which single keys may still change.
     architecture = str(changes.get("model", {}).get("architecture", "twise"))
-    base = TrainSettings(default_spec(architecture), seed=config.seed)
+    spec = default_spec(architecture)
+    base = TrainSettings(spec, Objective(default_kind(spec)), seed=config.seed)
     settings = with_changes(base, changes, "train")
-    return train(settings, DepthSamples(dataset), out, facts=training_facts(config))
+    held_back = min(settings.validation_frames, len(dataset) // 10) if settings.validate_every else 0
+    count = len(dataset) - held_back
+    samples = DepthSamples(dataset.select(dataset.ids[:count]), config.train.row_steps, config.train.calibration_jitter)
+    validation = [_validation_frame(dataset[frame_id], config) for frame_id in dataset.ids[count:]]
+    return train(settings, samples, out, validation=validation, facts=training_facts(config))
+
+
+def _validation_frame(frame: Frame, config: Config) -> DepthFrame:
+    """A held-back frame; with `row_steps`, at 16 rows of 64 and without jitter, so that figures of runs compare."""
+    from completion.types import DepthFrame
+
+    sparse = RowDrawing.of(frame, (4,), 0.0)(np.random.default_rng(0)) if config.train.row_steps else frame.sparse_depth
+    return DepthFrame(frame.image, sparse, frame.target_depth)
 
 
 def train_detection(config: Config, samples: CloudSamples, out: Path) -> Path:

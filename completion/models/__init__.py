@@ -13,10 +13,11 @@ from completion.depth_coefficients import Bins
 from completion.models.coefficients import CoefficientNetwork, CoefficientSparseToDense
 from completion.models.guided import Guided
 from completion.models.hourglass import MultiStack, Twise
+from completion.models.selection import Selection
 from completion.models.sparse_to_dense import SparseToDense, TwinSparseToDense
 
 RGB_SCALINGS = ("unit", "standardised", "raw")
-OUTPUTS = ("twin", "depth", "coefficients")
+OUTPUTS = ("twin", "depth", "coefficients", "mixture")
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,8 @@ class ModelSpec:
     arguments     keyword arguments of its builder
     depth_unit    metres per unit of the network's depth, in and out (80 for TWISE)
     rgb           "unit": / 255; "standardised": ImageNet mean and deviation; "raw": 0..255
-    output        "twin": foreground, background, sigma logit; "depth": one channel; "coefficients": logits per bin
+    output        "twin": foreground, background, sigma logit; "depth": one channel; "coefficients": logits per bin;
+                  "mixture": a distribution over a few depths (`completion.mixture`)
     multiple_of   height and width must be multiples of this
     """
 
@@ -82,6 +84,7 @@ MODELS: dict[str, Entry] = {
     ),
     "resnet_dc_to_dc": Entry(CoefficientSparseToDense, 1.0, "unit", "coefficients", 16),
     "guided": Entry(Guided, 1.0, "standardised", "twin", 64),
+    "selection": Entry(Selection, 1.0, "standardised", "mixture", 32),
 }
 
 

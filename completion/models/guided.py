@@ -39,6 +39,11 @@ class Residual(nn.Module):
         return F.relu(x + self.conv2(F.relu(self.conv1(x))))
 
 
+def _squareplus(x: Tensor) -> Tensor:
+    """Smooth and positive like softplus, without a logarithm: (x + sqrt(x^2 + 4)) / 2; squareplus(t - 1 / t) = t."""
+    return 0.5 * (x + torch.sqrt(x * x + 4))
+
+
 class CompactUNet(nn.Module):
     """(B, inputs, H, W) -> (B, outputs, H, W); works at 1/2 to 1/32 and returns to full size by pixel shuffle."""
 
@@ -79,14 +84,14 @@ class Guided(nn.Module):
     """
 
     def __init__(
-        self, width: int = 24, residual: float = 0.03, tilt: float = 1.5, cut: float = 0.02, init: str = "he"
+        self, width: int = 24, residual: float = 0.03, tilt: float = 0.5, cut: float = 0.02, init: str = "he"
     ) -> None:
         super().__init__()
         self.candidates = candidate_count() + 1  # and one drawn from the image
         if not 0 <= cut < 1:
             raise ValueError(f"cut: expected a share in [0, 1), got {cut}")
         self.residual, self.cut = residual, cut
-        self.tilt_bias = math.log(math.expm1(tilt))
+        self.tilt_bias = tilt - 1 / tilt
         # 2 sets of candidate logits, 2 tilts, 2 residuals, own candidate's log depth, sigma
         self.network = CompactUNet(14, 2 * self.candidates + 6, width)
         initialise(self, init)
@@ -123,10 +128,10 @@ class Guided(nn.Module):
     def _assemble(self, found: Candidates, raw: Tensor) -> Tensor:
         """Candidates (B, K, H, W) and raw outputs (B, 2(K+1)+6, H, W) -> (B, 3, H, W)."""
         near_logits, far_logits, rest = raw.split((self.candidates, self.candidates, 6), 1)
-        own = 0.3 + 2.3 * torch.tanh(rest[:, 4:5] / 2.3) + LOG_10M  # 1.4 to 135 m, at first about 13 m
+        own = 0.3 + 2.3 * F.softsign(rest[:, 4:5]) + LOG_10M  # 1.4 to 135 m, at first about 13 m
         log_depth = torch.cat((found.log_depth, own), 1)
         prior = torch.cat((found.prior, torch.full_like(own, -5.0)), 1)
-        tilt = F.softplus(rest[:, 0:2] + self.tilt_bias)
+        tilt = _squareplus(rest[:, 0:2] + self.tilt_bias)
         inverse = torch.exp(-log_depth)
         near = self._surface(prior + near_logits - tilt[:, 0:1] * log_depth, inverse, rest[:, 2:3])
         far = self._surface(prior + far_logits + tilt[:, 1:2] * log_depth, inverse, rest[:, 3:4])
@@ -137,7 +142,7 @@ class Guided(nn.Module):
         relative = torch.exp(logits - logits.amax(1, keepdim=True))
         weights = F.relu(relative - self.cut)
         mixed = (weights * inverse).sum(1, keepdim=True) / weights.sum(1, keepdim=True)
-        return (1 + self.residual * torch.tanh(correction)) / mixed
+        return (1 + self.residual * F.softsign(correction)) / mixed
 
     def _forward_fused(self, sparse: Tensor, rgb: Tensor) -> Tensor:
         """`forward` with everything but the convolutions in two numba passes."""

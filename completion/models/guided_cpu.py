@@ -63,8 +63,13 @@ def rings(sparse: Float) -> tuple[Float, Float]:
 
 
 @njit(inline="always")
-def _softplus(x: float) -> float:
-    return x + math.log1p(math.exp(-x)) if x > 0 else math.log1p(math.exp(x))
+def _squareplus(x: float) -> float:
+    return 0.5 * (x + math.sqrt(x * x + 4))
+
+
+@njit(inline="always")
+def _softsign(x: float) -> float:
+    return x / (1 + abs(x))
 
 
 @njit(parallel=True, cache=True, nogil=True)
@@ -109,10 +114,10 @@ def assemble(
                 k = measured - 2 + r
                 z[k] = log_depth[2 + r, y, x]
                 p[k] = prior[2 + r, y, x] - 4.0 if prior[2 + r, y, x] > -29 else _FAR
-            z[measured] = 0.3 + 2.3 * math.tanh(pixel[rest + 16] / 2.3) + math.log(10.0)
+            z[measured] = 0.3 + 2.3 * _softsign(pixel[rest + 16]) + math.log(10.0)
             p[measured] = -5.0
-            tilt_near = _softplus(pixel[rest] + tilt_bias)
-            tilt_far = _softplus(pixel[rest + 4] + tilt_bias)
+            tilt_near = _squareplus(pixel[rest] + tilt_bias)
+            tilt_far = _squareplus(pixel[rest + 4] + tilt_bias)
             top_near, top_far = np.float32(-1e9), np.float32(-1e9)
             for k in range(count):
                 near[k] = p[k] + pixel[4 * k + corner] - tilt_near * z[k]
@@ -128,8 +133,8 @@ def assemble(
                     weight = math.exp(far[k] - top_far) - cut
                     sum_far += weight
                     mix_far += weight * math.exp(-z[k])
-            one = (1 + residual * math.tanh(pixel[rest + 8])) * sum_near / mix_near
-            two = (1 + residual * math.tanh(pixel[rest + 12])) * sum_far / mix_far
+            one = (1 + residual * _softsign(pixel[rest + 8])) * sum_near / mix_near
+            two = (1 + residual * _softsign(pixel[rest + 12])) * sum_far / mix_far
             out[0, y, x], out[1, y, x] = min(one, two), max(one, two)
             out[2, y, x] = pixel[rest + 20]
     return out
