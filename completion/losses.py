@@ -1,6 +1,7 @@
 """Masked losses of depth completion (thesis sections 3.3, 4.3, 4.4). Depth and error in any one unit.
 
-Every loss takes maps (B, 1, h, w) and per-pixel weights (0 where the target has no value), averages over the weighted
+The cross-entropy of Depth Coefficients is `depth_coefficients.cross_entropy`; the sum over scales is
+`objectives.training_loss`. Every loss takes maps (B, 1, h, w) and per-pixel weights (0 where the target has no value), averages over the weighted
 pixels of each image and then over images; an image without valid pixels counts 0.
 """
 
@@ -21,6 +22,11 @@ def ale(error: Tensor, gamma: float) -> Tensor:
 def rale(error: Tensor, gamma: float) -> Tensor:
     """Reflected asymmetric linear error max(e / gamma, -gamma e) (Eq. 4.3): undershooting costs gamma."""
     return torch.maximum(error / gamma, -gamma * error)
+
+
+def fusion_error(foreground: Tensor, background: Tensor, sigma: Tensor, target: Tensor) -> Tensor:
+    """F(sigma) = |sigma d1 + (1 - sigma) d2 - d_t| (Eq. 4.6), per pixel."""
+    return (sigma * foreground + (1 - sigma) * background - target).abs()
 
 
 def masked_mean(values: Tensor, weights: Tensor) -> Tensor:
@@ -83,11 +89,10 @@ def twin_loss(
     foreground, background, logit = output.split(1, 1)
     sigma = torch.sigmoid(logit)
     near, far = (foreground.detach(), background.detach()) if detach_surfaces else (foreground, background)
-    fused = sigma * near + (1 - sigma) * far
     return TwinLoss(
         masked_mean(ale(foreground - target, gamma), weights),
         masked_mean(rale(background - target, gamma), weights),
-        masked_mean((fused - target).abs(), weights),
+        masked_mean(fusion_error(near, far, sigma, target), weights),
     )
 
 
