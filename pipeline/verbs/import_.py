@@ -1,0 +1,119 @@
+"""`--stage import`: public weights as our safetensors, and result pickles of OpenPCDet as KITTI result files."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from detection.kitti_format import KittiObject
+from pipeline.errors import DataError, UsageError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the verb."""
+    parser.add_argument("path", type=Path, metavar="FILE", help="a checkpoint, or OpenPCDet's result.pkl")
+    parser.add_argument(
+        "--architecture",
+        required=True,
+        metavar="NAME",
+        help="twise, twise_maxpool, msg_chn, msg_chn_wacv, sparse_to_dense; pointrcnn, epnet, openpcdet_pointrcnn; "
+        "or 'results' for a result.pkl",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE|DIR", help="NAME.safetensors, or the folder of "
+                        "result files")  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> int:
+    """Imports and says what was written. Raises UsageError for an unknown architecture, DataError for a bad file."""
+    if not args.path.is_file():
+        raise UsageError(f"no such file: {args.path}")
+    if args.architecture == "results":
+        print(f"{args.out}: {import_results(args.path, args.out)} result files")
+        return 0
+    if args.out.suffix != ".safetensors":
+        raise UsageError(f"--out {args.out}: expected a name that ends in .safetensors")
+    written = import_weights(args.path, args.architecture, args.out)
+    print(f"{written} and {written.with_suffix('.json').name}")
+    return 0
+
+
+def import_weights(path: Path, architecture: str, out: Path) -> Path:
+    """Writes a public checkpoint as safetensors with a card; nothing in the file is executed.
+
+    Raises UsageError for an unknown architecture, DataError when the file does not fit it.
+    """
+    from completion.importers import ARCHITECTURES
+    from detection.models.presets import IMPORTED_PRESETS
+
+    known = (*ARCHITECTURES, *IMPORTED_PRESETS)
+    if architecture not in known:
+        raise UsageError(f"unknown architecture {architecture!r}; known: {', '.join(known)}, results")
+    try:
+        if architecture in ARCHITECTURES:
+            from completion.checkpoints import convert_checkpoint
+
+            return convert_checkpoint(path, architecture, out)
+        return _import_detector(path, architecture, out)
+    except ValueError as error:
+        raise DataError(path, f"a checkpoint of {architecture}", str(error)) from None
+
+
+def _import_detector(path: Path, architecture: str, out: Path) -> Path:
+    from detection.checkpoints import import_checkpoint, save_checkpoint
+    from detection.models.presets import IMPORTED_PRESETS
+
+    model = import_checkpoint(path, architecture)
+    facts = {
+        "imported_from": path.name,
+        "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "architecture": architecture,
+    }
+    return save_checkpoint(model, IMPORTED_PRESETS[architecture](model), out, facts)
+
+
+def import_results(path: Path, out: Path) -> int:
+    """OpenPCDet's result.pkl (a list of frames with KITTI annotations) as one result file per frame; returns how many.
+
+    The pickle is read by an unpickler that knows containers and arrays only. Frames without objects give empty files.
+    Raises DataError when an entry lacks a field.
+    """
+    from pipeline.check.safe_pickle import load_infos
+    from pipeline.data.kitti_object import write_objects
+    from pipeline.paths import safe_id
+
+    frames = load_infos(path)
+    if not isinstance(frames, list):
+        raise DataError(path, "a list of frames", type(frames).__name__)
+    for frame in frames:
+        try:
+            name, objects = safe_id(str(frame["frame_id"])), result_objects(frame)
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise DataError(path, "frame_id, name, bbox, dimensions, location, rotation_y, score", f"{error}") from None
+        write_objects(out / f"{name}.txt", objects)
+    return len(frames)
+
+
+def result_objects(frame: Mapping[str, Any]) -> list[KittiObject]:
+    """The objects of one entry; its dimensions are l h w, KITTI's lines have h w l."""
+    found = []
+    for index, name in enumerate(frame["name"]):
+        l, h, w = (float(value) for value in frame["dimensions"][index])
+        x, y, z = (float(value) for value in frame["location"][index])
+        x1, y1, x2, y2 = (float(value) for value in frame["bbox"][index])
+        found.append(
+            KittiObject(
+                type=str(name),
+                truncated=-1,
+                occluded=-1,
+                alpha=float(frame["alpha"][index]),
+                bbox=(x1, y1, x2, y2),
+                size=(h, w, l),
+                location=(x, y, z),
+                ry=float(frame["rotation_y"][index]),
+                score=float(frame["score"][index]),
+            )
+        )
+    return found
