@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,14 +38,19 @@ class Road:
         """Direction of the centre line in radians from +x."""
         return np.asarray(self.curvature * np.asarray(s) + 0.5 * self.twist * np.asarray(s) ** 2)
 
-    def plan(self, s: NDArray[np.float64], d: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(..., 2) world x y of road coordinates."""
+    @cached_property
+    def _centre_line(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """s, x, y of the centre line, metre by metre; s = 0 lies at the origin."""
         nodes = np.arange(S_MIN - 50, S_MAX + 50, 1.0)
-        zero = int(-nodes[0])
         heading = self.heading(nodes + 0.5)
         x = np.concatenate([[0], np.cumsum(np.cos(heading))])[:-1]
         y = np.concatenate([[0], np.cumsum(np.sin(heading))])[:-1]
-        x, y = x - x[zero], y - y[zero]
+        zero = int(-nodes[0])
+        return nodes, x - x[zero], y - y[zero]
+
+    def plan(self, s: NDArray[np.float64], d: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(..., 2) world x y of road coordinates."""
+        nodes, x, y = self._centre_line
         at = self.heading(s)
         return np.stack([np.interp(s, nodes, x) - d * np.sin(at), np.interp(s, nodes, y) + d * np.cos(at)], axis=-1)
 

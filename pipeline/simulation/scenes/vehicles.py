@@ -161,7 +161,6 @@ def _sections(shape: BodyShape, x: NDArray[np.float64]) -> NDArray[np.float64]:
 def _material_of(shape: BodyShape, x: NDArray[np.float64], body: Surface) -> list[list[Surface]]:
     """Surface of each loft cell: glass for screens and side windows, dark plastic below, paint elsewhere."""
     cabin = (_roof_line(shape, x) - shape.belt) / (1 - shape.belt)
-    sill = replace(S.PLASTIC_DARK)
     rows: list[list[Surface]] = []
     for i in range(len(x) - 1):
         middle = 0.5 * (x[i] + x[i + 1])
@@ -171,7 +170,7 @@ def _material_of(shape: BodyShape, x: NDArray[np.float64], body: Surface) -> lis
         )
         pillar = any(abs(middle - p) < 0.012 for p in shape.pillars)
         side = min(cabin[i], cabin[i + 1]) > 0.25 and middle < shape.windowed_to and not pillar
-        cells = [sill, body, body, body, body]
+        cells = [S.PLASTIC_DARK, body, body, body, body]
         cells.append(S.GLASS_CAR if side and middle > shape.x_cowl + 0.35 * (shape.x_roof - shape.x_cowl) else body)
         cells.append(body)
         cells.append(S.GLASS_CAR if windscreen or rear_screen else body)
@@ -188,8 +187,8 @@ def _loft(shape: BodyShape, body: Surface) -> list[Part]:
     faces = grid_faces(rows, columns).reshape(-1, 2, 3)
     material = [cell for row in _material_of(shape, x, body) for cell in row]
     parts = []
-    for surface in dict.fromkeys(material):
-        chosen = np.array([cell == surface for cell in material])
+    for surface in {id(cell): cell for cell in material}.values():
+        chosen = np.array([cell is surface for cell in material])
         parts.append(Part(flat, faces[chosen].reshape(-1, 3), surface))
     for end in (0, rows - 1):
         ring = np.arange(columns) + end * columns
