@@ -12,7 +12,7 @@ from pipeline.verbs import available_verbs, verb_module
 
 STAGE_HELP = {
     "synth": "make the synthetic data set",
-    "train": "train a network (train.network=completion|detection)",
+    "train": "train a network (train.network=completion|detection|segmentation)",
     "complete": "sparse depth + image -> dense depth with two surfaces",
     "augment": "dense depth -> augmented LiDAR",
     "detect": "cloud -> 3D boxes as KITTI result files",

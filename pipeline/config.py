@@ -60,7 +60,10 @@ class AugmentConfig(LibrarySection):
     """The point-cloud stage; other keys change fields of the preset (`pipeline.pointcloud.presets`)."""
 
     preset: str = Field(default="L_D_F", description="L, D, D_F, D_SF, L_D_SF, L_D_SF_mask, ...")
-    semantics: str | None = Field(default=None, description="object masks; 'dataset' = the frame's own")
+    semantics: str | None = Field(
+        default=None, description="object masks: truth, boxes, files:FOLDER, network[:WEIGHTS], onnx:FILE, hf:FOLDER"
+    )
+    convention: str | None = Field(default=None, description="label convention of masks in files or of an ONNX model")
     depth_from: str | None = Field(
         default=None, description="folder of uint16 depth PNGs (ID.png) used instead of completion"
     )
@@ -90,7 +93,7 @@ class ReportConfig(Section):
 class TrainConfig(LibrarySection):
     """Training; other keys: the `TrainSettings` of the network's library."""
 
-    network: Literal["completion", "detection"] = "completion"
+    network: Literal["completion", "detection", "segmentation"] = "completion"
     # Completion only: every n-th LiDAR ring with n drawn from these, e.g. [1, 2, 4, 8]; none: the frame's sparse map.
     row_steps: tuple[int, ...] = ()
     # With row_steps: standard deviation in degrees of a random rotation between LiDAR and camera.

@@ -22,11 +22,12 @@ from pipeline.frame_files import FrameFiles
 from pipeline.paths import RunFolder
 from pipeline.runner.seeds import derive_seed
 from pipeline.settings import nearest_name, plain, with_changes
-from pipeline.weights import completion_weights, detection_weights, detector_name
+from pipeline.weights import completion_weights, detection_weights, detector_name, mask_weights
 
 if TYPE_CHECKING:
     from completion.types import CompletedDepth
     from pipeline.pointcloud.presets import AugmentSettings
+    from pipeline.semantics.sources import SemanticsSource
 
 FrameFunction = Callable[[Frame, FrameFiles], None]
 
@@ -87,10 +88,11 @@ def prepare_augment(config: Config) -> FrameFunction:
     from pipeline.pointcloud.augment import augment_frame
 
     settings = augment_settings(config)
+    masks = open_masks(config, settings)
 
     def augment(frame: Frame, files: FrameFiles) -> None:
         completed = with_sigma(completed_depth(config, frame, files), settings)
-        semantics = frame.semantics if settings.needs_semantics else None
+        semantics = masks.semantics(frame) if masks is not None else None
         seed = derive_seed(config.seed, frame.id, "augment")
         files.write_cloud(augment_frame(completed, frame.points, frame.calibration, settings, semantics, seed))
 
@@ -105,14 +107,21 @@ def augment_settings(config: Config) -> AugmentSettings:
     if section.preset not in PRESETS:
         raise UsageError(f"augment.preset: unknown preset {section.preset!r}; {nearest_name(section.preset, PRESETS)}")
     settings = with_changes(PRESETS[section.preset], section.library, "augment")
-    if section.semantics not in (None, "dataset"):
-        raise UsageError(f"augment.semantics: expected 'dataset' or nothing, got {section.semantics!r}")
     if settings.needs_semantics and section.semantics is None:
         raise UsageError(
-            f"augment.preset {section.preset} needs object masks: set augment.semantics=dataset when the data set has "
-            "them (synthetic, Virtual KITTI 2), or choose a preset without masks (L_D_F)"
+            f"augment.preset {section.preset} needs object masks: set augment.semantics to truth, boxes, files:FOLDER, "
+            "network, onnx:FILE or hf:FOLDER, or choose a preset without masks (L_D_F)"
         )
     return settings
+
+
+def open_masks(config: Config, settings: AugmentSettings) -> SemanticsSource | None:
+    """Where the object masks come from, or None when the settings use none."""
+    if not settings.needs_semantics or config.augment.semantics is None:
+        return None
+    from pipeline.semantics.sources import open_semantics
+
+    return open_semantics(config.augment.semantics, config.augment.convention)
 
 
 def completed_depth(config: Config, frame: Frame, files: FrameFiles) -> CompletedDepth:
@@ -139,22 +148,36 @@ def with_sigma(completed: CompletedDepth, settings: AugmentSettings) -> Complete
     return pseudo_sigma(completed.depth)
 
 
-def _augment_settings_record(config: Config) -> Any:
-    return {"settings": plain(augment_settings(config)), "seed": config.seed}
+def _augment_record(config: Config) -> Any:
+    section = config.augment
+    masks = (section.semantics, section.convention) if augment_settings(config).needs_semantics else None
+    return {"settings": plain(augment_settings(config)), "masks": masks, "seed": config.seed}
 
 
 def _augment_parts(config: Config, frame: Frame) -> tuple[str, ...]:
-    return (
-        ("points", "calibration", "semantics")
-        if augment_settings(config).needs_semantics
-        else ("points", "calibration")
-    )
+    parts = ("points", "calibration", "image_size")
+    kind = mask_kind(config)
+    return parts if kind is None else (*parts, *{"truth": ("semantics",), "boxes": ("labels",)}.get(kind, ("image",)))
+
+
+def mask_kind(config: Config) -> str | None:
+    """The kind of mask source (truth, boxes, files, network, onnx, hf) when the settings use masks."""
+    used = augment_settings(config).needs_semantics and config.augment.semantics is not None
+    return str(config.augment.semantics).partition(":")[0] if used else None
 
 
 def _augment_files(config: Config, run: RunFolder, frame_id: str) -> tuple[Path, ...]:
+    files: tuple[Path, ...] = (run.depth(frame_id), run.twin(frame_id))
     if config.augment.depth_from is not None:
-        return (Path(config.augment.depth_from) / f"{frame_id}.png",)
-    return run.depth(frame_id), run.twin(frame_id)
+        files = (Path(config.augment.depth_from) / f"{frame_id}.png",)
+    if mask_kind(config) == "files":
+        folder = Path(str(config.augment.semantics).partition(":")[2])
+        files += (folder / f"{frame_id}.png", folder / "mask.json")
+    return files
+
+
+def _augment_weights(config: Config) -> tuple[Path, ...]:
+    return () if mask_kind(config) is None else mask_weights(str(config.augment.semantics))
 
 
 # --- detect: cloud -> KITTI result lines
@@ -210,11 +233,11 @@ FRAME_STAGES: dict[str, FrameStage] = {
     ),
     "augment": FrameStage(
         prepare_augment,
-        _augment_settings_record,
+        _augment_record,
         _augment_parts,
         _augment_files,
-        lambda config: (),
-        ("pipeline/pointcloud", "pipeline/data"),
+        _augment_weights,
+        ("pipeline/pointcloud", "pipeline/semantics", "pipeline/data"),
         seconds=0.3,
         megabytes=0.8,
     ),

@@ -68,6 +68,30 @@ class CloudSamples:
         return PointFrame(points, camera.T_cam_velo, camera.P2, frame.image_size, frame.id), frame.labels
 
 
+@dataclass(frozen=True)
+class MaskSamples:
+    """Frames with class maps, as `pipeline.semantics.network` reads them."""
+
+    dataset: Dataset
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    def __getitem__(self, index: int, /) -> Frame:
+        return self.dataset[index]
+
+
+@dataclass(frozen=True)
+class SegmentationSettings:
+    """Training of the segmentation network; see `pipeline.semantics.network.train_segmenter`."""
+
+    steps: int = 3000
+    batch: int = 6
+    crop: tuple[int, int] = (256, 384)
+    rate: float = 3e-3
+    seed: int = 0
+
+
 def train_stage(config: Config, run: RunFolder) -> Path:
     """Trains, or continues to train, the network of the configuration; returns its weights."""
     dataset = open_frames(config, run)
@@ -76,6 +100,8 @@ def train_stage(config: Config, run: RunFolder) -> Path:
     try:
         if config.train.network == "completion":
             return train_completion(config, dataset, out)
+        if config.train.network == "segmentation":
+            return train_segmentation(config, dataset, out)
         return train_detection(config, CloudSamples(dataset, config, run), out)
     except DataError:
         raise
@@ -125,6 +151,24 @@ def train_detection(config: Config, samples: CloudSamples, out: Path) -> Path:
         print(f"step {progress.step} of {progress.steps}  {losses}", flush=True)
 
     return train(settings, samples, out, config.detection.device, report)
+
+
+def train_segmentation(config: Config, dataset: Dataset, out: Path) -> Path:
+    """`pipeline.semantics.network.train_segmenter` on frames with class maps."""
+    from pipeline.semantics.network import train_segmenter
+
+    if not dataset[0].has("semantics"):
+        raise UsageError(f"{dataset.root}: frame {dataset.ids[0]} has no class map to train segmentation on")
+    settings = with_changes(SegmentationSettings(seed=config.seed), config.train.library, "train")
+
+    def report(step: int, loss: float) -> None:
+        print(f"step {step} of {settings.steps}  loss {loss:.3f}", flush=True)
+
+    out.mkdir(parents=True, exist_ok=True)
+    samples: Any = MaskSamples(dataset)
+    return train_segmenter(
+        samples, out / "model", settings.steps, settings.batch, settings.crop, settings.rate, settings.seed, report
+    )
 
 
 def training_facts(config: Config) -> dict[str, Any]:

@@ -49,6 +49,18 @@ def detector_name(config: Config) -> str:
     return next((name for name in names if name.endswith(ending)), names[0])
 
 
+def mask_weights(source: str) -> tuple[Path, ...]:
+    """Files of the segmentation model that `augment.semantics` names: network[:WEIGHTS], onnx:FILE, hf:FOLDER."""
+    kind, _, place = source.partition(":")
+    if kind == "network":
+        return _files("pipeline/semantics", place or "street-small", "augment.semantics")
+    if kind == "onnx":
+        return (Path(place),)
+    if kind == "hf":
+        return tuple(sorted(path for path in Path(place).rglob("*") if path.is_file()))
+    return ()
+
+
 def _files(room: str, name: str, key: str, also: str = "") -> tuple[Path, ...]:
     """The .safetensors and the card of a path or an embedded name. Raises UsageError listing what there is."""
     for path in (Path(name), Path(name).with_suffix(".safetensors"), embedded_folder(room) / f"{name}.safetensors"):

@@ -270,6 +270,20 @@ def test_depth_from_a_folder_replaces_completion(data: Path, tmp_path: Path, cap
     assert not (out / "depth").exists()
 
 
+@pytest.mark.parametrize("source", ["truth", "boxes", "files"])
+def test_masks_come_from_the_source_that_is_asked_for(data: Path, tmp_path: Path, source: str) -> None:
+    out = tmp_path / "run"
+    if source == "files":
+        source = f"files:{data / 'training' / 'semantic_2'}"
+    options = ["--set", "augment.preset=L_D_SF", "--set", f"augment.semantics='{source}'"]
+    options += ["--set", "augment.convention=cityscapes_trainIds"]
+    command = ["--config", "kitti", "--stage", "augment", "--data", str(data), "--out", str(out), "--workers", "1"]
+    assert main([*command, *options]) == 0
+    steps = json.loads((out / "cloud" / "000000.json").read_text())["steps"]
+    mask = next(step for step in steps if step["step"] == "semantic_mask")
+    assert 0 < mask["out"] < mask["in"]
+
+
 def start(command: list[str]) -> subprocess.Popen[str]:
     """The command line as a process of its own."""
     arguments = [sys.executable, "-m", "pipeline.cli", *command]
