@@ -93,7 +93,7 @@ def detection_scores(dataset: Dataset, rows: Iterable[DetectionRow], completer: 
         for frame_id in dataset.ids:
             frame = dataset[frame_id]
             cloud = PointFrame(
-                _cloud(frame, row, complete),
+                augmented_points(frame, row, complete),
                 frame.calibration.T_cam_velo,
                 frame.calibration.P2,
                 frame.image_size,
@@ -106,7 +106,8 @@ def detection_scores(dataset: Dataset, rows: Iterable[DetectionRow], completer: 
     return results
 
 
-def _cloud(frame: Frame, row: DetectionRow, complete: Completer) -> NDArray[np.float32]:
+def augmented_points(frame: Frame, row: DetectionRow, complete: Completer) -> NDArray[np.float32]:
+    """The cloud of a row: raw points, or the preset's augmented cloud; (N, 4 or 5) LiDAR frame."""
     points = frame.points if row.rows == 64 else subsample_rows(frame.points, 64 // row.rows)
     if row.preset == "L":
         return points
