@@ -46,6 +46,11 @@ class PixelRays:
         x, y = -P2[0, 3] / P2[0, 0], -P2[1, 3] / P2[1, 1]
         return cls(slope_u, slope_v, np.ascontiguousarray(T[:3, :3]), T[:3, 0] * x + T[:3, 1] * y + T[:3, 3])
 
+    def reach(self, depth: NDArray[np.float32]) -> float:
+        """Metres that no point of the map is farther from the LiDAR than."""
+        longest = np.sqrt(1 + (self.slope_u**2).max(initial=0) + (self.slope_v**2).max(initial=0))
+        return float(np.abs(self.origin).max() + np.linalg.norm(self.R) * longest * depth.max(initial=0))
+
     def project_rows(self, depth: NDArray[np.float32], top: int, block: NDArray[np.float32]) -> int:
         """Write the points of whole image rows from `top` on into (3, rows * W) `block`; how many it took."""
         return int(_project_rows(depth, top, self.slope_u, self.slope_v, self.R, self.origin, block))

@@ -54,7 +54,9 @@ def occupied_cells(points: NDArray[np.float32], inverse_size: float, what: str) 
         raise ValueError(f"{what}: expected (N, 3 or more) float32 points, got {points.shape} {points.dtype}")
     builder, kept = CellBuilder(len(points), inverse_size, what), np.ones(len(points), np.bool_)
     for first in range(0, len(points), _BLOCK):
-        builder.add(np.ascontiguousarray(points[first : first + _BLOCK, :3].T), first, kept)
+        block = np.ascontiguousarray(points[first : first + _BLOCK, :3].T)
+        builder.check(float(np.abs(block).max()))
+        builder.add(block, first, kept)
     return builder.cells()
 
 
@@ -69,22 +71,33 @@ class CellBuilder:
         while capacity < min(points // 2, _LARGEST_FIRST_CAPACITY):
             capacity *= 2
         self.table, self.keys, self.count = np.full(capacity, -1, np.int32), np.empty(capacity // 2, np.int64), 0
+        # Room for the keys of a block, used again by the next.
+        self._keys, self._run_key = np.empty(0, np.int64), np.empty(0, np.int64)
 
     def add(self, block: NDArray[np.float32], first: int, kept: NDArray[np.bool_]) -> tuple[int, int]:
         """Number the next (3, n) block, whose points are `first` and the following; gives its range of runs.
 
-        Points that `kept` (of all points) does not mark are left out. Raises ValueError for a point without a cell.
+        Points that `kept` (of all points) does not mark are left out. The caller has checked the block's reach.
         """
         begin, width = self.runs, block.shape[1]
-        # Written so that NaN, which makes both extremes NaN, fails too.
-        if width and not max(float(block.max()), -float(block.min())) * self.inverse_size < CELL_LIMIT:
-            self._refuse(bool(np.isfinite(block).all()))
-        # One entry more than points: the last run ends where the key -2 follows, which no point has.
-        keys, run_key = np.full(width + 1, -2, np.int64), np.empty(width, np.int64)
-        runs = _cut_into_runs(block, first, kept, self.inverse_size, keys, run_key, self.run_start[begin:])
+        if len(self._keys) <= width:
+            self._keys, self._run_key = np.empty(width + 1, np.int64), np.empty(width, np.int64)
+        runs = _cut_into_runs(block, first, kept, self.inverse_size, self._keys, self._run_key, self.run_start[begin:])
         self.runs += runs
-        self._number(run_key[:runs], self.run_cell[begin : self.runs])
+        self._number(self._run_key[:runs], self.run_cell[begin : self.runs])
         return begin, self.runs
+
+    def check(self, reach: float) -> None:
+        """Raise ValueError when a coordinate of this absolute value has no cell; NaN has none."""
+        if reach * self.inverse_size < CELL_LIMIT:
+            return
+        if not np.isfinite(reach):
+            raise ValueError(f"{self.what}: the points hold NaN or infinite values; drop them first")
+        size = 1 / self.inverse_size
+        raise ValueError(
+            f"{self.what}: a point lies more than {CELL_LIMIT * size:g} m from the origin, too far for cells of "
+            f"{size:g} m; are the coordinates metres in the LiDAR frame?"
+        )
 
     def cells(self) -> Cells:
         """All cells so far."""
@@ -100,15 +113,6 @@ class CellBuilder:
             self.keys[: self.count] = old_keys
             _refill(self.table, self.keys, self.count)
             done, self.count = _number(run_key, run_cell, self.table, self.keys, done, self.count)
-
-    def _refuse(self, finite: bool) -> None:
-        if not finite:
-            raise ValueError(f"{self.what}: the points hold NaN or infinite values; drop them first")
-        size = 1 / self.inverse_size
-        raise ValueError(
-            f"{self.what}: a point lies more than {CELL_LIMIT * size:g} m from the origin, too far for cells of "
-            f"{size:g} m; are the coordinates metres in the LiDAR frame?"
-        )
 
 
 def mark_near(
@@ -152,6 +156,7 @@ def _slot(key, capacity):  # type: ignore[no-untyped-def]
 def _cut_into_runs(block, first, kept, inverse_size, keys, run_key, run_start):  # type: ignore[no-untyped-def]
     """Keys of a block's runs (-1: left out) and where they start; returns how many there are."""
     count, runs = block.shape[1], 0
+    keys[count] = -2  # no point has this key, so the last run ends before it
     for i in range(count):
         x, y, z = block[0, i] * inverse_size, block[1, i] * inverse_size, block[2, i] * inverse_size
         key = _pack(np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(z)))

@@ -72,6 +72,7 @@ def _cells_and_sums(
 ) -> tuple[Cells, NDArray[np.float64], list[tuple[int, int]]]:
     """Occupied cells of the kept pixels, (M, 4) sums of x, y, z and count (zero for "first"), and each block's runs."""
     builder = CellBuilder(depth.size, 1.0 / grid.size, "grid sampling")
+    builder.check(rays.reach(depth))
     sums, runs_of_block = np.zeros((len(builder.keys), 4)), []
     for block in _blocks(depth, rays):
         runs = builder.add(block.points, block.first, kept)

@@ -152,7 +152,7 @@ def test_missing_parts_are_named(frame: tuple) -> None:
     with pytest.raises(ValueError, match=r"semantics are \(2, 2\)"):
         augment_frame(completed, raw, small_calibration(), preset("D_SF"), semantics[:2, :2])
     raw[3, 1] = np.nan
-    with pytest.raises(ValueError, match="1 of .* NaN or infinite"):
+    with pytest.raises(ValueError, match=r"1 of .* NaN or infinite"):
         augment_frame(completed, raw, small_calibration(), preset("L"))
     with pytest.raises(ValueError, match="float32 x y z intensity"):
         augment_frame(completed, raw[:, :3], small_calibration(), preset("L"))

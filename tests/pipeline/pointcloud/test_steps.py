@@ -171,7 +171,7 @@ def test_grid_sampling_refuses_nan_and_infinity(bad: float) -> None:
 
 
 def test_grid_sampling_refuses_coordinates_beyond_its_numbers() -> None:
-    with pytest.raises(ValueError, match="too far for cells of 0.2 m"):
+    with pytest.raises(ValueError, match=r"too far for cells of 0\.2 m"):
         grid_sample(np.array([[3e5, 0, 0]], np.float32), GridSampling(0.2))
 
 
@@ -306,3 +306,15 @@ def _inside_by_hand(raw: np.ndarray, calibration: Calibration) -> np.ndarray:
     pixels, depth = calibration.cam_to_image(camera)
     column, row = np.rint(pixels).T
     return (depth > 0.5) & (column >= 0) & (column < 1242) & (row >= 0) & (row < 375)
+
+
+def test_temporary_memory_of_a_full_frame_stays_below_15_megabytes() -> None:
+    from benchmarks.pointcloud import temporary_memory
+
+    assert temporary_memory() < 15
+
+
+def test_one_pass_refuses_depth_too_far_for_its_cells() -> None:
+    depth = np.full((3, 4), 4e5, np.float32)
+    with pytest.raises(ValueError, match="too far for cells"):
+        back_project_and_sample(depth, small_calibration(), np.ones((3, 4), bool), GridSampling(0.2))
