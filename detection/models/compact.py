@@ -27,7 +27,7 @@ from detection.models.box_coding import (
     rpn_coder,
     to_roi_frame,
 )
-from detection.models.layers import PointLayer
+from detection.models.layers import PointLayer, maximum
 from detection.models.pointnet2 import PointNet2Backbone, SetAbstractionSpec
 from detection.models.proposals import ProposalSettings, select_proposals
 from detection.ops import iou_3d_aligned, roi_pool
@@ -197,9 +197,9 @@ class RegionStage(nn.Module):
         context = self._context(regions, empty[0])
         hidden = F.relu(self.point_in(rows) + self.region_in(context).unsqueeze(1), inplace=True)
         hidden = F.relu(self.point_hidden(hidden), inplace=True)
-        first = F.relu(self.first_out(hidden).max(dim=1).values)
+        first = F.relu(maximum(self.first_out(hidden)))
         second = F.relu(self.second_in(hidden) + self.maximum_in(first).unsqueeze(1), inplace=True)
-        second = F.relu(self.second_out(second).max(dim=1).values)
+        second = F.relu(maximum(self.second_out(second)))
         joined = F.relu(self.join(self.norm(torch.cat([first, second, context], dim=1))))
         score = self.score(F.relu(self.score_hidden(joined))).squeeze(1)
         return score, self.box(F.relu(self.box_hidden(joined)))

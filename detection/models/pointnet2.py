@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from detection.models.layers import IndexedMLP, PointMLP, SharedMLP, project
+from detection.models.layers import IndexedMLP, PointMLP, SharedMLP, maximum, project
 from detection.ops import ball_query, furthest_point_sample, interpolation_weights, three_nn
 
 # How a checkpoint names the layers of a point network.
@@ -95,7 +95,7 @@ class GroupAll(nn.Module):
     def forward(self, xyz: Tensor, features: Tensor) -> Tensor:
         """xyz (B, N, 3), features (B, N, C) -> (B, C')."""
         rows = torch.cat([xyz, features], dim=-1)
-        return cast(Tensor, self.mlps[0](rows)).max(dim=1).values
+        return maximum(self.mlps[0](rows))
 
 
 def interpolate_rows(unknown: Tensor, known: Tensor, features: Tensor) -> Tensor:
