@@ -16,6 +16,9 @@ from pipeline.runner.progress import duration
 if TYPE_CHECKING:
     from pipeline.runner.estimate import StageEstimate
 
+# Notes printed with the results; all of them stand in tables.md and in the report.
+NOTES = 3
+
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """A table on standard output, first column to the left, numbers to the right; no wider than it must be."""
@@ -61,8 +64,11 @@ def print_results(run: RunFolder) -> None:
         print_table("Average precision (percent)", ap_header(metrics), ap_rows(metrics))
     if depth_rows(metrics):
         print_table("Completed depth", ["measure", "mean"], depth_rows(metrics))
-    for warning in metrics.get("warnings", []):
+    warnings = metrics.get("warnings", [])
+    for warning in warnings[:NOTES]:
         print(f"note: {warning}")
+    if len(warnings) > NOTES:
+        print(f"note: {len(warnings) - NOTES} more in {run.tables}")
 
 
 def print_dry_run(estimates: Sequence[StageEstimate], run: RunFolder, config: Config) -> None:

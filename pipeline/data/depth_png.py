@@ -55,7 +55,7 @@ def png_bytes(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
     import cv2
 
     stored = pixels[:, :, ::-1] if pixels.ndim == 3 else pixels
-    # Level 1 with the default filter: within 10 % of level 6 on depth maps at a third of the time.
+    # Level 1: a completed KITTI depth map is 15 % larger than at level 6 and takes a fifth of the time.
     done, data = cv2.imencode(".png", np.ascontiguousarray(stored), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not done:
         raise ValueError(f"cannot write a PNG of shape {pixels.shape} dtype {pixels.dtype}")
