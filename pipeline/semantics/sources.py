@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,9 @@ from pipeline.data.frame import Frame
 from pipeline.data.images import read_unchanged
 from pipeline.errors import DataError, UsageError
 from pipeline.semantics.conventions import NONE, to_train_ids
+
+if TYPE_CHECKING:
+    from pipeline.semantics.network import NetworkSegmenter
 
 # KITTI type -> Cityscapes trainId.
 KITTI_CLASSES = {
@@ -32,8 +35,8 @@ KITTI_CLASSES = {
 class SemanticsSource(Protocol):
     """Anything that gives a frame's semantics."""
 
-    def semantics(self, frame: Frame) -> NDArray[np.uint8]:
-        """(H, W) uint8 Cityscapes trainIds, 255 = none."""
+    def semantics(self, frame: Frame) -> NDArray[np.uint8] | NDArray[np.float32]:
+        """(H, W) uint8 Cityscapes trainIds, 255 = none; or float32 scores in [0, 1] of the relevant classes."""
         ...
 
 
@@ -90,8 +93,22 @@ class ModelMasks:
         return self.model.segment(frame.image)
 
 
+@dataclass(frozen=True)
+class SoftMasks:
+    """Our network's probability that a pixel shows any of `classes` (trainIds)."""
+
+    model: NetworkSegmenter
+    classes: tuple[int, ...]
+
+    def semantics(self, frame: Frame) -> NDArray[np.float32]:
+        """(H, W) float32 scores of this frame."""
+        return self.model.score(frame.image, self.classes)
+
+
 def open_semantics(source: str, convention: str | None = None) -> SemanticsSource:
-    """The source that a setting names: truth, boxes, files:FOLDER, network[:WEIGHTS], onnx:FILE, hf:FOLDER.
+    """The source a setting names: truth, boxes, files:FOLDER, network[:WEIGHTS], soft[:WEIGHTS], onnx:FILE, hf:FOLDER.
+
+    "soft" gives the network's scores of vehicles, pedestrians and cyclists instead of labels.
 
     convention  of the labels in files or of an ONNX model's output; a folder may hold it in mask.json instead
 
@@ -106,6 +123,11 @@ def open_semantics(source: str, convention: str | None = None) -> SemanticsSourc
         from pipeline.semantics.network import load_segmenter
 
         return ModelMasks(load_segmenter(place or "street-small"))
+    if kind == "soft":
+        from pipeline.pointcloud.semantic_mask import OBJECTS
+        from pipeline.semantics.network import load_segmenter
+
+        return SoftMasks(load_segmenter(place or "street-small"), OBJECTS)
     if place and kind == "files":
         return MaskFolder(Path(place), _stated_convention(Path(place), convention))
     if place and kind == "onnx":
@@ -116,7 +138,8 @@ def open_semantics(source: str, convention: str | None = None) -> SemanticsSourc
         from pipeline.semantics.huggingface import HuggingFaceSegmenter
 
         return ModelMasks(HuggingFaceSegmenter(place))
-    raise UsageError(f"semantics: expected truth, boxes, files:FOLDER, network, onnx:FILE or hf:FOLDER, got {source!r}")
+    kinds = "truth, boxes, files:FOLDER, network, soft, onnx:FILE or hf:FOLDER"
+    raise UsageError(f"semantics: expected {kinds}, got {source!r}")
 
 
 def boxes_to_semantics(labels: Sequence[KittiObject], image_size: tuple[int, int]) -> NDArray[np.uint8]:

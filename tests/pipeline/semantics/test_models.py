@@ -57,6 +57,22 @@ def test_training_learns_and_weights_survive_the_file(tmp_path: Path) -> None:
     assert '"StreetSegmenter"' in path.with_suffix(".json").read_text()
 
 
+def test_soft_source_gives_scores_and_network_source_labels(tmp_path: Path) -> None:
+    from pipeline.data.frame import Frame
+    from pipeline.semantics.network import save_segmenter
+    from pipeline.semantics.sources import open_semantics
+
+    torch.manual_seed(0)
+    weights = save_segmenter(StreetSegmenter(), tmp_path / "random", {})
+    image = picture(np.random.default_rng(2)).image
+    frame = Frame("1", {"image": lambda: image})
+    score = open_semantics(f"soft:{weights}").semantics(frame)
+    assert score.dtype == np.float32
+    assert score.shape == image.shape[:2]
+    assert 0 <= score.min() < score.max() <= 1
+    assert open_semantics(f"network:{weights}").semantics(frame).dtype == np.uint8
+
+
 def test_training_is_repeatable(tmp_path: Path) -> None:
     samples = [picture(np.random.default_rng(1))]
     paths = [train_segmenter(samples, tmp_path / n, steps=2, batch=1, crop=(64, 64), seed=3) for n in ("a", "b")]
