@@ -101,7 +101,7 @@ def _pattern(
     if kind == _ASPHALT:
         grain = _fractal(x, y, z, 0.05, 3, footprint)
         wide = _fractal(x, y, z, 2.5, 4, footprint)
-        return min(1.0, max(0.0, 0.9 * wide - 0.15)), max(0.2, 1.0 + 2.2 * (grain - 0.5))
+        return min(1.0, max(0.0, 0.9 * wide - 0.15)), max(0.2, 1.0 + 2.8 * (grain - 0.5))
     if kind == _PAVING:
         joint, stone = _joints(u, v, scale, scale, 0.5, 0.008, footprint)
         return max(joint, 0.35 * stone), 0.75 + 0.5 * _fractal(x, y, z, 0.9, 4, footprint)
@@ -197,7 +197,7 @@ def shade(
             towards = 0.3 + 0.5 * abs(towards)
         if texture[s] != _PAINT and texture[s] != _GLASS:
             fine = _fractal(p[0], p[1], p[2], 0.11, 3, footprint)
-            factor = max(0.15, factor * (1 + (0.25 if texture[s] == _PLASTER else 0.6) * (fine - 0.5)))
+            factor = max(0.15, factor * (1 + (0.35 if texture[s] == _PLASTER else 1.0) * (fine - 0.5)))
         sunlight = direct * max(towards, 0.0) if lit[i] else 0.0
         skylight = ambient * (0.55 + 0.45 * n[2])
         for c in range(3):
@@ -215,7 +215,7 @@ def shade(
                 dark = 0.10 + 0.35 * _noise(6 * mirror[0] + p[0], 6 * mirror[1] + p[1], 8 * mirror[2])
                 for c in range(3):
                     seen[c] = dark * horizon[c]
-            fresnel = 0.07 + 0.93 * (1 - min(max(cosine, 0.0), 1.0)) ** 5
+            fresnel = 0.11 + 0.89 * (1 - min(max(cosine, 0.0), 1.0)) ** 5
             glint = mirror[0] * sun[0] + mirror[1] * sun[1] + mirror[2] * sun[2]
             flash = 9.0 * max(glint, 0.0) ** 220 * direct if lit[i] else 0.0
             for c in range(3):
