@@ -57,13 +57,19 @@ def check_calibration(calibration: Calibration, frame: str, where: str, size: tu
 
 def _check_rig(calibration: Calibration, frame: str, where: str, size: tuple[int, int]) -> list[Finding]:
     f, cx, cy = calibration.P2[0, 0], calibration.P2[0, 2], calibration.P2[1, 2]
+    own = KITTI_RIGS.get(size)
+    if own is not None and abs(f - own[0]) < 0.01 and max(abs(cx - own[1]), abs(cy - own[2])) > 3:
+        message = f"principal point {cx:.2f}, {cy:.2f} of a cropped image, expected {own[1]:.2f}, {own[2]:.2f}"
+        return [Finding("wrong_crop", frame, where, message)]
     for rig_size, (focal, column, row) in KITTI_RIGS.items():
         if abs(f - focal) > 0.01 or rig_size == size:
             continue
         uncropped = abs(cx - column) < 0.01 and abs(cy - row) < 0.01
         if size in KITTI_RIGS and uncropped:
-            own = KITTI_RIGS[size][0]
-            message = f"focal length {f:.2f} of the {rig_size[1]} x {rig_size[0]} rig, expected {own:.2f} for this size"
+            own_focal = KITTI_RIGS[size][0]
+            message = (
+                f"focal length {f:.2f} of the {rig_size[1]} x {rig_size[0]} rig, expected {own_focal:.2f} for this size"
+            )
             return [Finding("other_rigs_calibration", frame, where, message)]
         if size[0] < rig_size[0] and size[1] <= rig_size[1] and uncropped:
             message = f"cy {cy:.2f} belongs to the uncropped image, expected {cy - (rig_size[0] - size[0]):.2f}"

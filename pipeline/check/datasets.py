@@ -15,7 +15,7 @@ import numpy as np
 from pipeline.check.clouds import CloudFacts
 from pipeline.check.faults import Finding
 from pipeline.check.frames import FrameFacts, Place, examine_frame
-from pipeline.check.images import OFFSETS, Structure, agreement
+from pipeline.check.images import CROP_SHIFTS, OFFSETS, Structure, agreement
 from pipeline.data.dataset import Dataset
 from pipeline.export.workers import map_ordered
 
@@ -40,6 +40,7 @@ class Comparison:
     rigs: dict[tuple[int, int], dict[tuple[float, ...], list[str]]] = field(default_factory=dict)
     tall_cars: int = 0
     all_cars: int = 0
+    gains: dict[str, tuple[float, ...]] = field(default_factory=dict)
     scores: dict[str, dict[int, float]] = field(default_factory=dict)
     window: deque[tuple[str, Structure | None]] = field(default_factory=deque)
 
@@ -58,6 +59,8 @@ class Comparison:
             self.rigs.setdefault(facts.size, {}).setdefault(facts.rig, []).append(facts.frame)
         self.tall_cars += facts.cars[0]
         self.all_cars += facts.cars[1]
+        if facts.gains:
+            self.gains[facts.frame] = facts.gains
         self._compare(facts)
 
     def _compare(self, facts: FrameFacts) -> None:
@@ -82,6 +85,8 @@ class Comparison:
         yield from self._truncated()
         yield from self._other_rigs()
         yield from self._offsets()
+        yield from self._shifted()
+        yield from self._gaps()
         if self.all_cars >= 20 and self.tall_cars > 0.8 * self.all_cars:
             message = f"{self.tall_cars} of {self.all_cars} cars are higher than wide: height and width exchanged?"
             yield Finding("swapped_dimensions", "", self.root, message)
@@ -153,6 +158,30 @@ class Comparison:
                     message = f"images of {frame} and {other} fit each other's clouds"
                     yield Finding("index_offset", frame, self.root, message)
                     yield Finding("index_offset", other, self.root, message)
+
+    def _shifted(self) -> Iterator[Finding]:
+        """A crop that was not undone in any frame."""
+        if len(self.gains) < 4:
+            return
+        gains = np.array(list(self.gains.values()))
+        means, errors = gains.mean(axis=0), gains.std(axis=0) / np.sqrt(len(gains))
+        best = int(np.argmax(means))
+        if means[best] > 0.04 and means[best] > 3 * errors[best]:
+            rows, columns = (4 * cells for cells in CROP_SHIFTS[best])
+            for frame in self.gains:
+                message = f"images and clouds fit when the images are moved by about {-rows} rows, {-columns} columns"
+                yield Finding("wrong_crop", frame, self.root, message)
+
+    def _gaps(self) -> Iterator[Finding]:
+        """Numbers left out of KITTI's running numbers, when nearly all are there."""
+        if self.layout != "kitti_object" or len(self.present) < 10 or not all(f.isdigit() for f in self.present):
+            return
+        numbers = {int(frame) for frame in self.present}
+        absent = sorted(set(range(min(numbers), max(numbers))) - numbers)
+        if 10 * len(absent) <= len(numbers):
+            for number in absent:
+                message = f"frames {min(numbers):06d} to {max(numbers):06d} are there but for {len(absent)}"
+                yield Finding("missing_file", f"{number:06d}", self.root, message)
 
 
 def _exchanged(scores: dict[int, float], other: dict[int, float], offset: int) -> bool:

@@ -55,6 +55,7 @@ FAULTS: dict[str, Fault] = {
     "swapped_dimensions": _fault(1, "labels", "KITTI lines hold height, width, length in this order"),
     "degrees_not_radians": _fault(1, "labels", "multiply by pi / 180: angles are in radians"),
     "yaw_sign": _fault(1, "labels", "ry turns about the camera's y axis, which points down: negate it"),
+    "label_unit": _fault(1, "labels", "sizes and locations are in metres"),
     "unknown_class": _fault(1, "labels", "use KITTI's class names (Car, Van, Truck, Pedestrian, ...)"),
     "label_outside_image": _fault(1, "labels", "boxes belong to another image size or crop"),
     "far_plane_as_depth": _fault(1, "depth", "65535 is sky in Virtual KITTI 2: write 0 (no value) instead"),

@@ -20,7 +20,7 @@ from pipeline.check.calibrations import calibration_key, check_calibration, chec
 from pipeline.check.clouds import CloudFacts, check_cloud, cloud_facts, read_raw_cloud
 from pipeline.check.depths import check_depth, file_fault, read_map
 from pipeline.check.faults import Finding
-from pipeline.check.images import Structure, colours_swapped, structure
+from pipeline.check.images import CROP_SHIFTS, Structure, colours_swapped, shift_gains, structure
 from pipeline.check.labels import check_objects, read_objects
 from pipeline.data.calibration import Calibration
 from pipeline.data.frame import Frame
@@ -38,6 +38,8 @@ _HASHED = ("image", "points", "labels")
 # A labelled object this near has returns on it, whatever the LiDAR.
 _NEAR = 25.0
 _FEWEST_RETURNS = 5
+# Gain of a crop shift that is believed from one frame alone; smaller ones are averaged over the frames.
+_CERTAIN_GAIN = 0.1
 # Share of a frame's near objects that must hold returns before another reading of the data is believed.
 _CERTAIN = 0.8
 # Horizontal axes in the orders that occur: the vertical one is judged from the cloud alone.
@@ -71,6 +73,7 @@ class FrameFacts:
     size: tuple[int, int] | None = None
     rig: tuple[float, ...] | None = None
     structure: Structure | None = None
+    gains: tuple[float, ...] = ()
     cars: tuple[int, int] = (0, 0)
 
 
@@ -131,7 +134,14 @@ def examine_frame(open_frame: Callable[[str], Frame], place: Place) -> FrameFact
     _check_placement(parts, open_frame, place)
     _check_depths(parts, open_frame, place)
     cars = [o for o in parts.objects if o.type == "Car"]
-    comparable = parts.image is not None and parts.points is not None and parts.calibration is not None
+    maps = None
+    if parts.image is not None and parts.points is not None and parts.calibration is not None:
+        maps = structure(parts.image, parts.points, parts.calibration)
+    gains = () if maps is None else shift_gains(maps)
+    if gains and max(gains) > _CERTAIN_GAIN:
+        rows, columns = (4 * cells for cells in CROP_SHIFTS[int(np.argmax(gains))])
+        message = f"image and cloud fit when the image is moved by about {-rows} rows and {-columns} columns"
+        parts.findings.append(Finding("wrong_crop", frame.id, parts.where("image"), message))
     return FrameFacts(
         frame=frame.id,
         findings=tuple(parts.findings),
@@ -141,7 +151,8 @@ def examine_frame(open_frame: Callable[[str], Frame], place: Place) -> FrameFact
         cloud=None if parts.points is None else cloud_facts(parts.points),
         size=parts.size,
         rig=None if parts.calibration is None else calibration_key(parts.calibration),
-        structure=structure(parts.image, parts.points, parts.calibration) if comparable else None,  # type: ignore[arg-type]
+        structure=maps,
+        gains=gains,
         cars=(sum(o.size[0] > o.size[1] for o in cars), len(cars)),
     )
 

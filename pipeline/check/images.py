@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,10 @@ from pipeline.data.calibration import Calibration
 # Neighbouring frames that are tried when image and cloud do not fit.
 OFFSETS = (-2, -1, 1, 2)
 _CELL = 4
+# Shifts in cells by which a crop that was not undone moves the image: KITTI's (23, 13) px, the centre crop's (11, 13).
+CROP_SHIFTS = tuple(
+    (s * rows, s * columns) for rows, columns in ((6, 3), (3, 3), (0, 3), (6, 0), (3, 0)) for s in (1, -1)
+)
 
 
 def colours_swapped(image: NDArray[np.uint8]) -> tuple[float, float] | None:
@@ -101,3 +106,26 @@ def agreement(cloud: Structure, image: Structure) -> float:
     steps, edges = cloud.steps[window][seen].astype(np.float64), image.edges[window][seen].astype(np.float64)
     spread = steps.std() * edges.std() if len(steps) else 0.0
     return float(((steps - steps.mean()) * (edges - edges.mean())).mean() / spread) if spread > 0 else 0.0
+
+
+def shift_gains(maps: Structure) -> tuple[float, ...]:
+    """By how much each of CROP_SHIFTS makes a frame's cloud fit its image better than it does in place.
+
+    Negative for a frame in order (at most +0.03 on KITTI object 000000-000010); 0.1 to 0.26 for the shift of a crop.
+    """
+    in_place = agreement(maps, maps)
+    gains = []
+    for rows, columns in CROP_SHIFTS:
+        moved = Structure(
+            _window(maps.edges, rows, columns),
+            _window(maps.steps, -rows, -columns),
+            _window(maps.seen, -rows, -columns),
+        )
+        gains.append(agreement(moved, moved) - in_place)
+    return tuple(gains)
+
+
+def _window(cells: NDArray[Any], rows: int, columns: int) -> NDArray[Any]:
+    """The part of a map that is left when it is moved up by `rows` and left by `columns`."""
+    height, width = cells.shape
+    return cells[max(rows, 0) : height + min(rows, 0), max(columns, 0) : width + min(columns, 0)]

@@ -53,6 +53,9 @@ def check_objects(
     message = _degrees(cared)
     if message:
         return [*findings, Finding("degrees_not_radians", frame, where, message)]
+    message = _unit(cared)
+    if message:
+        return [*findings, Finding("label_unit", frame, where, message)]
     message = _dimensions(cared)
     if message:
         return [*findings, Finding("swapped_dimensions", frame, where, message)]
@@ -67,6 +70,11 @@ def _degrees(objects: list[KittiObject]) -> str:
     limit = 2 * np.pi + 0.01
     wrong = [o for o in objects if abs(o.ry) > limit or (abs(o.alpha) > limit and o.alpha != UNKNOWN_ALPHA)]
     return f"{wrong[0].type} with ry {wrong[0].ry:g}, alpha {wrong[0].alpha:g}" if wrong else ""
+
+
+def _unit(objects: list[KittiObject]) -> str:
+    wrong = [o for o in objects if max(o.size) > 100 or (max(map(abs, o.location)) > 300 and o.location[0] != -1000)]
+    return f"{wrong[0].type} of size {wrong[0].size} at {wrong[0].location}" if wrong else ""
 
 
 def _dimensions(objects: list[KittiObject]) -> str:

@@ -22,8 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="twise, twise_maxpool, msg_chn, msg_chn_wacv, sparse_to_dense; pointrcnn, epnet, openpcdet_pointrcnn; "
         "or 'results' for a result.pkl",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE|DIR", help="NAME.safetensors, or the folder of "
-                        "result files")  # fmt: skip
+    out = "NAME.safetensors, or the folder of result files"
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE|DIR", help=out)
 
 
 def run(args: argparse.Namespace) -> int:

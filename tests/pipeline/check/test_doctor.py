@@ -253,6 +253,7 @@ LABEL_FAULTS: dict[str, Callable[[list[str]], list[str]]] = {
     "malformed_labels": lambda line: line[:12],
     "degrees_not_radians": fields((14, np.degrees), (3, np.degrees)),
     "yaw_sign": fields((14, lambda ry: -ry + 0.5), (3, lambda alpha: alpha - 0.5)),
+    "label_unit": fields(*((index, lambda value: 1000 * value) for index in range(8, 14))),
     "unknown_class": lambda line: ["automobile", *line[1:]],
     "label_outside_image": fields((6, lambda x2: x2 + 1000)),
     "labels_disagree_with_cloud": fields((13, lambda z: z + 9)),
@@ -333,6 +334,42 @@ def test_a_crop_from_the_top_left_corner(kitti: Path) -> None:
 def test_the_official_crop_is_no_fault(kitti: Path) -> None:
     plant_depth(kitti, lambda code, _: code[23:, 13 : 13 + 1216])
     assert names(kitti) == set()
+
+
+def test_images_moved_by_a_crop(kitti: Path) -> None:
+    for frame in FRAMES:
+        path = part_path(kitti, "image_2", frame)
+        image = cv2.imread(str(path))[:, :, ::-1]
+        moved = np.zeros_like(image)
+        moved[23:, 13:] = image[: len(image) - 23, :-13]
+        replace(path, png_bytes(moved))
+    assert names(kitti) == {"wrong_crop"}
+
+
+def test_a_cropped_image_with_the_full_calibration(kitti: Path) -> None:
+    path = part_path(kitti, "image_2")
+    replace(path, png_bytes(np.ascontiguousarray(cv2.imread(str(path))[23:, 13:1229, ::-1])))
+    assert names(kitti) == {"wrong_crop"}
+
+
+def test_the_calibration_of_a_crop_with_the_full_image(kitti: Path) -> None:
+    path = part_path(kitti, "calib")
+    replace(path, path.read_text().replace("1.728540000000e+02", "1.498540000000e+02"))
+    assert names(kitti) == {"wrong_crop"}
+
+
+def test_a_number_left_out(kitti_object: Path, tmp_path: Path) -> None:
+    shutil.copytree(kitti_object / "training" / "label_2", tmp_path / "training" / "label_2")
+    for part in ("velodyne", "calib"):
+        (tmp_path / "training" / part).mkdir()
+        for path in (kitti_object / "training" / part).iterdir():
+            if path.stem != "000005":
+                (tmp_path / "training" / part / path.name).symlink_to(path)
+    (tmp_path / "training" / "label_2" / "000005.txt").chmod(0o644)
+    (tmp_path / "training" / "label_2").chmod(0o755)
+    (tmp_path / "training" / "label_2" / "000005.txt").unlink()
+    report = check(tmp_path, workers=1)
+    assert [(finding.fault, finding.frame) for finding in report.findings] == [("missing_file", "000005")]
 
 
 def test_intrinsics_of_the_uncropped_image(kitti_depth: Path, tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ import torch
 from detection.kitti_format import parse_lines
 from pipeline.cli import main
 
-
 EMPTY = ("name", "alpha", "bbox", "dimensions", "location", "rotation_y", "score")
 
 
