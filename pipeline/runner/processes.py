@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
@@ -39,6 +40,8 @@ def available_cores() -> int:
 
 def use_one_thread() -> None:
     """One computing thread in this process: by environment for libraries yet to be imported, by call for the others."""
+    # With an old TBB on the machine Numba takes another threading layer and says so: nothing a user has to act on.
+    warnings.filterwarnings("ignore", message="The TBB threading layer requires")
     numba = sys.modules.get("numba")
     for name in _THREAD_VARIABLES:
         # Numba reads its variable again while it compiles, and refuses another value once its threads are running.

@@ -110,6 +110,50 @@ def test_damaged_weights_refuse_the_run(data: Path, weights: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
+def test_the_demo_makes_its_own_data_once(weights: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "demo"
+    options = ["--out", str(out), "--workers", "1", "--set", "synth.frames=2", "--set", "synth.size=[94, 310]"]
+    options += ["--set", f"detection.model={weights}"]
+    assert main(options) == 0
+    assert len(list((out / "data" / "training" / "velodyne").glob("*.bin"))) == 2
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["depth"]["frames"] == 2
+    assert len(metrics["frames"]["scored"]) == 2
+    assert "Points per augmentation step" in (out / "report" / "index.html").read_text()
+    before = {path: path.stat().st_mtime_ns for path in (out / "data").rglob("*") if path.is_file()}
+    assert main(options) == 0
+    assert {path: path.stat().st_mtime_ns for path in (out / "data").rglob("*") if path.is_file()} == before
+    # Fewer frames: the run's own folder holds exactly what is asked for.
+    assert main([*options, "--set", "synth.frames=1", "--stage", "synth"]) == 0
+    assert len(list((out / "data" / "training" / "velodyne").glob("*.bin"))) == 1
+    capsys.readouterr()
+    assert main([*options, "--set", "synth.fraems=1"]) == 2
+    assert "unknown setting synth.fraems; did you mean 'frames'?" in capsys.readouterr().err
+
+
+def test_synthetic_data_is_never_written_into_a_folder_of_the_users(tmp_path: Path, capsys) -> None:
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "thesis.txt").write_text("three years of work")
+    assert main(["--stage", "synth", "--data", str(mine), "--out", str(tmp_path / "run")]) == 2
+    assert "holds files that the synth stage did not write" in capsys.readouterr().err
+    assert [path.name for path in mine.iterdir()] == ["thesis.txt"]
+
+
+@pytest.mark.slow
+def test_training_segmentation_gives_weights_that_mask(data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    options = ["--config", "kitti", "--data", str(data), "--out", str(out), "--workers", "1"]
+    options += ["--set", "train.network=segmentation", "--set", "train.steps=1", "--set", "train.batch=1"]
+    assert main([*options, "--set", "train.crop=[32, 64]", "--stage", "train"]) == 0
+    weights = out / "weights" / "segmentation" / "model.safetensors"
+    masks = ["--set", "augment.preset=L_D_SF", "--set", f"augment.semantics=network:{weights}", "--stage", "augment"]
+    assert main([*options[:8], *masks]) == 0
+    steps = json.loads((out / "cloud" / "000000.json").read_text())["steps"]
+    assert "semantic_mask" in [step["step"] for step in steps]
+
+
+@pytest.mark.slow
 def test_training_a_detector_gives_weights_that_detect(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     options = ["--config", "kitti", "--data", str(data), "--out", str(out), "--workers", "1"]
