@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.check.faults import Finding
+from pipeline.data.kitti_object import MAX_COORDINATE
 
 ROW = 16
 # LiDARs of cars end at 120-250 m; the median return of a street lies at 10-20 m.
@@ -54,6 +55,16 @@ def check_cloud(points: NDArray[np.floating], frame: str, where: str) -> list[Fi
     if middle > _MILLIMETRE_MEDIAN:
         message = f"half of the points are farther than {middle:.0f} m"
         return [Finding("cloud_in_millimetres", frame, where, message)]
+    wild = np.abs(points[:, :3]).max(axis=1) > MAX_COORDINATE
+    if wild.any():
+        message = (
+            f"{int(wild.sum())} of {len(points)} points lie beyond {MAX_COORDINATE:g} m (first: {int(wild.argmax())})"
+        )
+        return [Finding("non_finite_points", frame, where, message)]
+    nowhere = int((distance == 0).sum())
+    if nowhere > 0.1 * len(points):
+        message = f"{nowhere} of {len(points)} points are 0 0 0: the file was not written to its end"
+        return [Finding("truncated_cloud", frame, where, message)]
     order = _vertical_axis(points)
     if order != 2:
         message = f"the flat axis is {'xyz'[order]} (column {order + 1}), expected z (column 3)"

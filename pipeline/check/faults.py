@@ -44,7 +44,7 @@ FAULTS: dict[str, Fault] = {
     "calibration_not_rigid": _fault(
         1, "calibration", "rotations must be orthonormal with determinant 1: copy it again"
     ),
-    "non_finite_points": _fault(1, "points", "drop points with NaN or infinite values"),
+    "non_finite_points": _fault(1, "points", "drop points with NaN, infinite or absurd values"),
     "cloud_in_millimetres": _fault(1, "points", "divide coordinates by 1000"),
     "axis_order": _fault(1, "points", "KITTI clouds are x forward, y left, z up"),
     "float16_loss": _fault(1, "points", "keep float32: float16 rounds by up to 3 cm beyond 64 m"),

@@ -13,6 +13,8 @@ from pipeline.data.calibration import Calibration
 # Neighbouring frames that are tried when image and cloud do not fit.
 OFFSETS = (-2, -1, 1, 2)
 _CELL = 4
+# A KITTI frame has about 9000 cells with returns.
+_FEWEST_CELLS = 1000
 # Shifts in cells by which a crop that was not undone moves the image: KITTI's (23, 13) px, the centre crop's (11, 13).
 CROP_SHIFTS = tuple(
     (s * rows, s * columns) for rows, columns in ((6, 3), (3, 3), (0, 3), (6, 0), (3, 0)) for s in (1, -1)
@@ -53,10 +55,14 @@ class Structure:
     seen: NDArray[np.bool_]
 
 
-def structure(image: NDArray[np.uint8], points: NDArray[np.floating], calibration: Calibration) -> Structure:
-    """The maps of one frame; points (N, 3+) in the LiDAR frame."""
+def structure(image: NDArray[np.uint8], points: NDArray[np.floating], calibration: Calibration) -> Structure | None:
+    """The maps of one frame, None with too few returns to compare; points (N, 3+) in the LiDAR frame."""
     size = (image.shape[0] // _CELL, image.shape[1] // _CELL)
+    if min(size) < 8:
+        return None
     steps, seen = _depth_steps(points, calibration, size)
+    if seen.sum() < _FEWEST_CELLS:
+        return None
     return Structure(_image_edges(image, size), steps, seen)
 
 
