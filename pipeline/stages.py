@@ -94,9 +94,20 @@ def prepare_augment(config: Config) -> FrameFunction:
         completed = with_sigma(completed_depth(config, frame, files), settings)
         semantics = masks.semantics(frame) if masks is not None else None
         seed = derive_seed(config.seed, frame.id, "augment")
-        files.write_cloud(augment_frame(completed, frame.points, frame.calibration, settings, semantics, seed))
+        files.write_cloud(augment_frame(completed, lidar_of(frame), frame.calibration, settings, semantics, seed))
 
     return augment
+
+
+def lidar_of(frame: Frame) -> NDArray[np.float32]:
+    """(N, 4) LiDAR points; where sparse depth is stored instead (Virtual KITTI 2), its pixels back-projected."""
+    if frame.has("points"):
+        return frame.points
+    from pipeline.pointcloud.backproject import back_project
+
+    sparse = frame.sparse_depth
+    points = back_project(sparse, frame.calibration, sparse > 0).points
+    return np.column_stack([points, np.zeros(len(points))]).astype(np.float32)
 
 
 def augment_settings(config: Config) -> AugmentSettings:
@@ -155,9 +166,14 @@ def _augment_record(config: Config) -> Any:
 
 
 def _augment_parts(config: Config, frame: Frame) -> tuple[str, ...]:
-    parts = ("points", "calibration", "image_size")
+    parts = (*lidar_parts(frame), "image_size")
     kind = mask_kind(config)
     return parts if kind is None else (*parts, *{"truth": ("semantics",), "boxes": ("labels",)}.get(kind, ("image",)))
+
+
+def lidar_parts(frame: Frame) -> tuple[str, ...]:
+    """The parts that `lidar_of` reads."""
+    return ("points" if frame.has("points") else "sparse_depth", "calibration")
 
 
 def mask_kind(config: Config) -> str | None:
@@ -207,11 +223,11 @@ def uses_raw_lidar(config: Config) -> bool:
 
 def cloud_of(config: Config, frame: Frame, files: FrameFiles) -> NDArray[np.float32]:
     """(N, 4 or 5 + C) float32 points for the detector, LiDAR frame."""
-    return frame.points if uses_raw_lidar(config) else files.read_cloud()
+    return lidar_of(frame) if uses_raw_lidar(config) else files.read_cloud()
 
 
 def _detect_parts(config: Config, frame: Frame) -> tuple[str, ...]:
-    return ("calibration", "image_size", "points") if uses_raw_lidar(config) else ("calibration", "image_size")
+    return (*lidar_parts(frame), "image_size") if uses_raw_lidar(config) else ("calibration", "image_size")
 
 
 def _detect_files(config: Config, run: RunFolder, frame_id: str) -> tuple[Path, ...]:
@@ -280,8 +296,11 @@ def frame_stages_for(stage: str, config: Config, has_points: bool = True) -> lis
 
 
 def has_points(dataset: Dataset) -> bool:
-    """True when the frames of the data set come with LiDAR points."""
-    return len(dataset) == 0 or dataset[0].has("points")
+    """True when the frames of the data set come with LiDAR points, or with sparse depth and labelled objects."""
+    if len(dataset) == 0:
+        return True
+    frame = dataset[0]
+    return frame.has("points") or (frame.has("sparse_depth") and frame.has("labels"))
 
 
 def data_root(config: Config, run: RunFolder) -> Path:

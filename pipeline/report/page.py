@@ -171,6 +171,8 @@ def _add_cloud(frame: Frame, files: FrameFiles, view: FrameView) -> None:
         counts = files.read_counts()
         view.steps, view.points = counts["steps"], counts["points"]
         points, measured = cloud[:, :3], cloud[:, 4] == 0
+    elif not frame.has("points"):
+        return
     else:
         points = frame.points[:, :3]
         measured = np.ones(len(points), dtype=bool)

@@ -319,6 +319,20 @@ def test_a_killed_run_continues_and_ends_with_the_same_bytes(tmp_path: Path, wor
 
 
 @pytest.mark.slow
+def test_two_processes_on_one_folder_do_not_disturb_each_other(tmp_path: Path) -> None:
+    data = write_tiny_kitti(tmp_path / "kitti", 8)
+    command = [*AUGMENT, "--data", str(data), "--workers", "1"]
+    assert main([*command, "--out", str(tmp_path / "alone")]) == 0
+    out = tmp_path / "shared"
+    processes = [start([*command, "--out", str(out)]) for _ in range(2)]
+    for process in processes:
+        _, error = process.communicate(timeout=100)
+        assert process.returncode == 0, error
+    assert contents(out) == contents(tmp_path / "alone")
+    assert len(done_frames(out, "augment")) == 8
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_finishes_the_frame_in_hand_and_says_how_to_continue(tmp_path: Path, number: signal.Signals) -> None:
     data = write_tiny_kitti(tmp_path / "kitti", 24)

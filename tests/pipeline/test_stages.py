@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from detection.kitti_format import parse_lines
@@ -195,6 +196,26 @@ def test_training_completion_gives_weights_that_complete(data: Path, tmp_path: P
 )
 def test_a_stage_runs_what_it_needs_and_nothing_after(stage, changes, has_points, expected) -> None:
     assert frame_stages_for(stage, Config.model_validate(changes), has_points) == expected
+
+
+def test_sparse_depth_of_labelled_frames_serves_as_lidar() -> None:
+    from pipeline.data import Dataset, Frame
+    from pipeline.stages import has_points, lidar_of
+    from tests.pipeline.tiny_kitti import CALIBRATION
+
+    sparse = np.zeros((48, 96), np.float32)
+    sparse[30, 50], sparse[40, 20] = 10.0, 5.0
+    loaders = {"sparse_depth": lambda: sparse, "calibration": lambda: CALIBRATION}
+    indoor = Frame("1", loaders)
+    street = Frame("1", {**loaders, "labels": lambda: []})
+    assert not has_points(Dataset(("1",), lambda _: indoor))
+    assert has_points(Dataset(("1",), lambda _: street))
+    points = lidar_of(street)
+    assert points.shape == (2, 4)
+    pixels, depth = CALIBRATION.cam_to_image(CALIBRATION.velo_to_cam(points))
+    # Back-projection leaves out the last row of P2 (3 mm here), projection does not.
+    np.testing.assert_allclose(pixels, [[50, 30], [20, 40]], atol=0.05)
+    np.testing.assert_allclose(depth, [10, 5], rtol=1e-6)
 
 
 def test_detection_needs_points() -> None:
