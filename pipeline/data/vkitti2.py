@@ -28,6 +28,7 @@ from pipeline.data.depth_png import read_depth_png
 from pipeline.data.frame import Frame
 from pipeline.data.images import check_complete, image_size, read_bytes, read_image, read_unchanged
 from pipeline.data.kitti_depth import camera_only
+from pipeline.data.lidar_like import depth_points, sample_like_lidar
 from pipeline.data.vkitti2_text import VkittiObject, objects_of_frame, read_camera_rows, read_colors
 from pipeline.errors import DataError, UsageError
 
@@ -156,9 +157,23 @@ def open_frame(root: Path, frame_id: str) -> Frame:
             loaders[part] = partial(reader, path)
     if (text / "intrinsic.txt").is_file():
         loaders["calibration"] = partial(read_frame_calibration, root, frame_id)
+        if "target_depth" in loaders and "sparse_depth" not in loaders:
+            loaders["sparse_depth"] = partial(_sampled, root, frame_id, files["target_depth"][1])
+        if "sparse_depth" in loaders:
+            loaders["points"] = partial(_sampled_points, root, frame_id, loaders["sparse_depth"])
     if (text / "bbox.txt").is_file() and (text / "pose.txt").is_file():
         loaders["labels"] = partial(read_labels, root, frame_id)
     return Frame(frame_id, loaders, str(root))
+
+
+def _sampled(root: Path, frame_id: str, depth: Path) -> NDArray[np.float32]:
+    """(H, W) metres of a 64-row LiDAR-like subsampling of the dense depth (`lidar_like.sample_like_lidar`)."""
+    return sample_like_lidar(read_depth(depth), read_frame_calibration(root, frame_id))
+
+
+def _sampled_points(root: Path, frame_id: str, sparse: Callable[[], Any]) -> NDArray[np.float32]:
+    """(N, 4) the sparse depth as a cloud, intensity 0."""
+    return depth_points(sparse(), read_frame_calibration(root, frame_id))
 
 
 def sampled_depth_path(root: Path, frame_id: str) -> Path:

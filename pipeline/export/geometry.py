@@ -1,4 +1,4 @@
-"""Pixels with depth <-> LiDAR points, exactly; points in boxes."""
+"""Pixels of depth maps; LiDAR points in the image and in boxes."""
 
 from __future__ import annotations
 
@@ -10,19 +10,6 @@ from detection.types import Boxes3D
 from pipeline.data.calibration import Calibration
 
 Array = NDArray[np.float64]
-
-
-def pixels_to_velo(u: Array, v: Array, depth: Array, calibration: Calibration) -> Array:
-    """(N,) columns, rows and depths (z of rectified camera 0, metres) -> (N, 3) points in the LiDAR frame.
-
-    The exact inverse of P2, with its third row: KITTI's P2 has 2.7 mm in the corner, which moves a near pixel by a
-    third of a pixel when it is left out.
-    """
-    P2 = calibration.P2
-    w = P2[2, 2] * depth + P2[2, 3]
-    x = (u * w - P2[0, 2] * depth - P2[0, 3]) / P2[0, 0]
-    y = (v * w - P2[1, 2] * depth - P2[1, 3]) / P2[1, 1]
-    return calibration.cam_to_velo(np.column_stack([x, y, depth]))
 
 
 def depth_pixels(depth: NDArray[np.float32]) -> tuple[Array, Array, Array]:

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.depth_png import depth_png_bytes
-from pipeline.export.geometry import depth_pixels, pixels_to_velo
+from pipeline.data.lidar_like import pixels_to_velo
+from pipeline.export.geometry import depth_pixels
 from pipeline.export.kitti_tree import write_kitti_frame
 from pipeline.export.record import Options, Record
 from pipeline.export.source import ExportFrame

@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.export.geometry import depth_pixels, in_image, pixels_to_velo
+from pipeline.data.lidar_like import pixels_to_velo
+from pipeline.export.geometry import depth_pixels, in_image
 from pipeline.export.kitti_tree import write_kitti_frame
 from pipeline.export.record import Options, Record
 from pipeline.export.source import ExportFrame

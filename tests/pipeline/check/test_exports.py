@@ -191,7 +191,7 @@ def test_virconv_of_another_frame(source: tuple[Dataset, Path], tmp_path: Path) 
 
 def test_virconv_from_the_top_left_crop_with_centre_offsets(source: tuple[Dataset, Path], tmp_path: Path) -> None:
     """The original generator's slip: the top-left window, lifted with a camera matrix moved by (13, 11.5) px."""
-    from pipeline.export.geometry import pixels_to_velo
+    from pipeline.data.lidar_like import pixels_to_velo
 
     out = exported(source, tmp_path, "virconv")
     calibration = source[0][VICTIM].calibration
