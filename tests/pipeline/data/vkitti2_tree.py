@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 
 import cv2
@@ -58,7 +59,8 @@ def write_tree(root: Path, scene: str, frames: int, variation: str = "clone") ->
 
 
 def _write_images(folder: Path, frame: int, camera: int, rows: dict[str, list[str]]) -> None:
-    rgb = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+    seed = zlib.crc32(f"{folder.parent.name}/{folder.name}/{frame}/{camera}".encode())
+    rgb = np.random.default_rng(seed).integers(100, 150, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     depth = np.full((HEIGHT, WIDTH), 65535, np.uint16)
     depth[200:] = 3000
     classes = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
