@@ -46,6 +46,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (UsageError, DataError) as error:
         print(f"run_pipeline: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("run_pipeline: interrupted; the same command continues where it was", file=sys.stderr)
+        return 130
     except BrokenPipeError:
         # The reader of our output went away (`run_pipeline ... | head`).
         sys.stderr.close()

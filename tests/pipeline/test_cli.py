@@ -355,3 +355,22 @@ def test_a_read_only_folder_is_one_line(data: Path, tmp_path: Path, capsys) -> N
     locked.mkdir(mode=0o500)
     assert main([*AUGMENT, "--data", str(data), "--out", str(locked / "run")]) == 2
     assert "the run folder cannot be written" in capsys.readouterr().err
+
+
+def test_an_interrupt_outside_the_batch_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    from pipeline import run
+
+    def interrupted(_: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run, "carry_out", interrupted)
+    assert main([]) == 130
+    assert capsys.readouterr().err == "run_pipeline: interrupted; the same command continues where it was\n"
+
+
+@pytest.mark.parametrize("options", [["--stage", "evaluate", "--help"], ["--stage=check", "--help"]])
+def test_verbs_have_their_own_help(options: list[str], capsys) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(options)
+    assert end.value.code == 0
+    assert "usage: run_pipeline --stage" in capsys.readouterr().out
