@@ -60,6 +60,7 @@ class CompactSettings:
     roi_widths        widths of the second stage's point networks
     rois              which proposals train the second stage
     iou_range         IoU of the refined box that counts as score 0 and score 1
+    point_share       of the first stage's logit added to the second's when detecting
     """
 
     classes: tuple[str, ...] = CLASSES
@@ -73,6 +74,7 @@ class CompactSettings:
     roi_widths: tuple[int, int] = (48, 96)
     rois: RoiSamplingSettings = _ROIS
     iou_range: tuple[float, float] = (0.25, 0.85)
+    point_share: float = 0.3
 
     def widened(self, factor: float) -> CompactSettings:
         """The same settings with the widths of the backbone times `factor`, in multiples of 8."""
@@ -324,5 +326,6 @@ class CompactPointRCNN(nn.Module):
         found = []
         for cloud, regions in zip(batch.clouds, self.propose(batch.points, scored, self.settings.proposals_test)):
             logits, code = self.regions(cloud, regions)
+            logits = logits + self.settings.point_share * regions.logits
             found.append(RawDetections(refined_boxes(regions.rois, code), logits, regions.classes))
         return found

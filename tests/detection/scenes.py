@@ -29,11 +29,11 @@ def surface_points(box: NDArray[np.float64], count: int, rng: np.random.Generato
     return np.stack([box[0] + x, box[1] - h / 2 + local[:, 1], box[2] + z], axis=1)
 
 
-def place_cars(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """(count, 7) boxes of car size, 8 to 25 m ahead, at least 6 m apart, in view of the camera."""
+def place_cars(count: int, rng: np.random.Generator, farthest: float = 25.0) -> NDArray[np.float64]:
+    """(count, 7) boxes of car size, from 8 m to `farthest` ahead, at least 6 m apart, in view of the camera."""
     boxes: list[NDArray[np.float64]] = []
     while len(boxes) < count:
-        z = rng.uniform(8, 25)
+        z = rng.uniform(8, farthest)
         x = rng.uniform(-0.6, 0.6) * z
         if all(np.hypot(x - other[0], z - other[2]) > 6 for other in boxes):
             size = np.array([1.53, 1.63, 3.9]) * rng.uniform(0.9, 1.1)

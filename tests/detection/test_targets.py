@@ -107,7 +107,7 @@ def test_rois_match_truth_of_their_class_only(rng) -> None:
 
 
 def test_ground_truth_as_proposals_returns_through_the_second_stage(rng) -> None:
-    truth = torch.tensor(place_cars(12, rng))
+    truth = torch.tensor(place_cars(12, rng, farthest=60))
     classes = torch.ones(12, dtype=torch.long)
     chosen = sample_rois(truth, classes, truth, classes, RoiSamplingSettings(), rng)
     kept = chosen.iou > 0.55
