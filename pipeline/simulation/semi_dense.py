@@ -62,7 +62,7 @@ def stereo_depth(left: NDArray[np.uint8], right: NDArray[np.uint8], focal: float
     count = int(np.clip(16 * np.ceil(192 * focal / 721.5377 / 16), 16, 192))
     matcher = cv2.StereoSGBM.create(
         minDisparity=0, numDisparities=count, blockSize=5, P1=8 * 3 * 25, P2=32 * 3 * 25, disp12MaxDiff=1,
-        uniquenessRatio=5, speckleWindowSize=100, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+        uniquenessRatio=15, speckleWindowSize=100, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )  # fmt: skip
     # The matcher leaves the first `count` columns empty: they are padded and cut again.
     padded = [cv2.copyMakeBorder(image, 0, 0, count, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
@@ -75,7 +75,7 @@ def stereo_depth(left: NDArray[np.uint8], right: NDArray[np.uint8], focal: float
 
 def consistent(
     accumulated: NDArray[np.float32], current: NDArray[np.float32], stereo: NDArray[np.float32],
-    tolerance: float = 0.05, max_depth: float = 80.0,
+    tolerance: float = 0.03, max_depth: float = 80.0,
 ) -> NDArray[np.float32]:  # fmt: skip
     """The accumulated map where it agrees with stereo; all maps (H, W) metres, 0 = none.
 
