@@ -25,6 +25,7 @@ from pipeline.data.dataset import Dataset
 from pipeline.data.frame import Frame
 from pipeline.data.nyuv2 import open_nyuv2_full
 from pipeline.errors import DataError, UsageError
+from pipeline.export.source import in_run
 from pipeline.export.workers import default_workers, map_ordered
 
 Examine = Callable[[Callable[[str], Frame], Path, Place, str], list[Finding]]
@@ -159,7 +160,8 @@ def _check_folder(
     wanted = dataset.select(frames).ids if frames else dataset.ids
     expected = _expected(path, wanted, names, found, kind)
     known = frozenset(dataset.ids)
-    places = [_place(dataset.ids, index) for index, frame in enumerate(dataset.ids) if frame in found or kind == "run"]
+    present = found if kind != "run" else {frame for frame in dataset.ids if in_run(path, frame)}
+    places = [_place(dataset.ids, index) for index, frame in enumerate(dataset.ids) if frame in present]
     task = partial(_examine_one, dataset.open, tree, examine, found)
 
     def findings() -> Iterator[Finding]:

@@ -122,6 +122,12 @@ def read_augmented(run: RunFolder, frame_id: str) -> Cloud:
     return Cloud(points, BASE_COLUMNS + names)
 
 
+def in_run(root: Path, frame_id: str) -> bool:
+    """True when a run folder holds something of a frame."""
+    run = RunFolder(root)
+    return any(path.is_file() for path in (run.depth(frame_id), run.cloud(frame_id), run.detections(frame_id)))
+
+
 def consumer_names(frame_ids: Sequence[str]) -> dict[str, str]:
     """Frame id -> file name of the consumer's layouts, which know six-digit numbers only.
 

@@ -41,6 +41,7 @@ def run(args: argparse.Namespace) -> int:
     from pipeline.data import open_dataset
     from pipeline.export.export import export
     from pipeline.export.record import Options
+    from pipeline.export.source import in_run
     from pipeline.export.workers import default_workers
 
     if args.run is not None and not args.run.is_dir():
@@ -49,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     if args.frames:
         dataset = dataset.select(args.frames)
     elif args.run is not None:
-        dataset = dataset.select([frame_id for frame_id in dataset.ids if _in_run(args.run, frame_id)])
+        dataset = dataset.select([frame_id for frame_id in dataset.ids if in_run(args.run, frame_id)])
         if not len(dataset):
             raise UsageError(f"{args.run}: no frame of {args.data} in it (expected depth/ID.png or cloud/ID.bin)")
     compat = frozenset(name.strip() for name in args.compat.split(",") if name.strip())
@@ -62,11 +63,3 @@ def run(args: argparse.Namespace) -> int:
     for frame_id, reason in summary.failures.items():
         print(f"failed: {frame_id}: {reason}", file=sys.stderr)
     return 1 if summary.failures else 0
-
-
-def _in_run(run_folder: Path, frame_id: str) -> bool:
-    """True when the run holds something of the frame."""
-    from pipeline.paths import RunFolder
-
-    files = RunFolder(run_folder)
-    return any(path.is_file() for path in (files.depth(frame_id), files.cloud(frame_id), files.detections(frame_id)))
