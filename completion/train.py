@@ -163,6 +163,8 @@ def train(
             last_saved = time.monotonic()
         if finished:
             break
+    if processes > 1:
+        torch.distributed.barrier()  # the first process has written the files that every one returns
     best = run.out / "best.safetensors"
     return best if best.is_file() else run.out / "last.safetensors"
 
@@ -282,7 +284,7 @@ class _Run:
         )
 
     def log(self, step: int) -> None:
-        """A row of log.csv, and TensorBoard scalars: means since the last row."""
+        """A row of log.csv, and TensorBoard scalars: means since the last row, of the first process' samples."""
         steps = self.sums.pop("steps")
         parts = {name: value / steps for name, value in self.sums.items()}
         self.sums = {}
