@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from detection.boxes import observation_angle, project_to_image
 from detection.kitti_format import KittiObject, format_line
-from detection.types import Boxes3D, Detections, PointFrame
+from detection.types import Detections, PointFrame
 
 
 def result_objects(detections: Detections, frame: PointFrame) -> list[KittiObject]:
@@ -31,9 +31,3 @@ def result_objects(detections: Detections, frame: PointFrame) -> list[KittiObjec
 def result_text(detections: Detections, frame: PointFrame) -> str:
     """The content of a result file; empty (not missing) when nothing is found."""
     return "".join(f"{format_line(item)}\n" for item in result_objects(detections, frame))
-
-
-def boxes_in_image(boxes: Boxes3D, frame: PointFrame) -> list[bool]:
-    """Whether each box touches the frame's image."""
-    rectangles = project_to_image(boxes, frame.P2, frame.image_size)
-    return [bool(x2 > x1 and y2 > y1) for x1, y1, x2, y2 in rectangles]

@@ -223,6 +223,36 @@ def test_openpcdet_forward_is_shaped_and_repeatable() -> None:
     assert torch.equal(refined.boxes, again.boxes)
 
 
+def test_openpcdet_forward_agrees_with_the_twin() -> None:
+    model = randomised(OpenPCDetPointRCNN(), 4)
+    assert isinstance(model, OpenPCDetPointRCNN)
+    points = scene(700, 1, 8)[..., [2, 0, 1, 3]]
+    state = model.state_dict()
+    named = state | twin.official_names(state, bare="xyz_up_layer|merge_down_layer")
+    with torch.no_grad():
+        heads, proposals, refined = model(points)
+        features = twin.backbone(named, points[0])
+        torch.testing.assert_close(heads.backbone_features[0], features, rtol=1e-4, atol=1e-4)
+        hidden = features
+        for conv, norm in ((0, 1), (3, 4)):
+            hidden = twin.dense(state, "point_head.cls_layers", conv, norm, hidden)
+        logits = state["point_head.cls_layers.6.weight"] @ hidden + state["point_head.cls_layers.6.bias"][:, None]
+        torch.testing.assert_close(heads.cls[0].T, logits, rtol=1e-4, atol=1e-4)
+        boxes = model.decode_proposals(points, heads)[0]
+        code, mean = heads.box[0, 5].double(), [(3.9, 1.6, 1.56), (0.8, 0.6, 1.73), (1.76, 0.6, 1.73)]
+        l, w, h = mean[int(heads.cls[0, 5].argmax())]
+        dx, dy, dz, *logs, cos, sin = code.tolist()
+        centre = points[0, 5, :3].double().numpy() + np.array([dx * np.hypot(l, w), dy * np.hypot(l, w), dz * h])
+        expected = [*centre, *(np.exp(logs) * [l, w, h]), np.arctan2(sin, cos)]
+        np.testing.assert_allclose(boxes[5].numpy(), expected, rtol=1e-4)
+        score, depth = heads.cls[0].max(dim=1).values.sigmoid(), points[0, :, :3].norm(dim=1) / 70 - 0.5
+        extra = torch.cat([score[:, None], depth[:, None], heads.backbone_features[0].T], dim=1)
+        for k in range(4):
+            logit, box = twin.openpcdet_refine(named, points[0], extra, proposals.rois[0, k].double().numpy())
+            assert refined.cls[0, k, 0].item() == pytest.approx(logit, rel=1e-3, abs=1e-3)
+            np.testing.assert_allclose(refined.boxes[0, k].numpy(), box, rtol=1e-3, atol=1e-3)
+
+
 @pytest.mark.parametrize("name", sorted(PRESETS))
 def test_presets_can_be_rebuilt_from_their_options(name) -> None:
     preset = PRESETS[name]()

@@ -6,6 +6,7 @@ Shares nothing with `detection.models` but the names of the weights; the point o
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import torch
@@ -85,10 +86,9 @@ def backbone(state: dict[str, Tensor], points: Tensor) -> Tensor:
 
 def heads(state: dict[str, Tensor], features: Tensor) -> tuple[Tensor, Tensor]:
     """(128, N) -> class logits (N,), codes (N, C)."""
-    out = []
-    for name in ("rpn.rpn_cls_layer", "rpn.rpn_reg_layer"):
-        out.append(conv(state, f"{name}.2", conv(state, f"{name}.0", features), relu=False))
-    return out[0][0], out[1].T
+    names = ("rpn.rpn_cls_layer", "rpn.rpn_reg_layer")
+    cls, reg = (conv(state, f"{name}.2", conv(state, f"{name}.0", features), relu=False) for name in names)
+    return cls[0], reg.T
 
 
 def decode(code: np.ndarray, scope: float, head_bins: int, fine: bool, soft: bool, folded: bool) -> list[float]:
@@ -186,3 +186,62 @@ def refine(
     box_x = x + dx * math.cos(ry) + dz * math.sin(ry)
     box_z = z - dx * math.sin(ry) + dz * math.cos(ry)
     return float(out[0][0]), np.array([box_x, y + dy, box_z, h, w, l, ry + dry])
+
+
+def official_names(state: dict[str, Tensor], bare: str) -> dict[str, Tensor]:
+    """OpenPCDet's indexed names (0 convolution, 1 normalisation, 2 ReLU, ...) as layer0.conv, layer0.bn.bn, ...
+
+    bare  pattern of the modules whose convolutions follow each other without normalisation (0, 2, ...)
+    """
+    found = {}
+    for name, value in state.items():
+        match = re.fullmatch(r"(.*)\.(\d+)\.(\w+)", name)
+        if match is None:
+            continue
+        prefix, index, part = match[1], int(match[2]), match[3]
+        period = 2 if re.search(bare, prefix) else 3
+        kind = "conv" if index % period == 0 else "bn.bn"
+        found[f"{prefix}.layer{index // period}.{kind}.{part}".replace("backbone_3d.", "rpn.backbone_net.")] = value
+    return found
+
+
+def openpcdet_refine(
+    state: dict[str, Tensor], points: Tensor, extra: Tensor, roi: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Logit and refined box (7,) of one LiDAR-form RoI; extra (N, 2 + 128) score, depth, features."""
+    x, y, z, l, w, h, heading = roi
+    d = points[:, :3].double().numpy() - [x, y, z]
+    c, s = math.cos(heading), math.sin(heading)
+    local = np.stack([d[:, 0] * c + d[:, 1] * s, d[:, 1] * c - d[:, 0] * s, d[:, 2]], axis=1)
+    inside = np.flatnonzero((np.abs(local) <= [l / 2, w / 2, h / 2]).all(axis=1))[:512]
+    rows = torch.zeros(512, 133)
+    if len(inside):
+        chosen = np.resize(inside, 512)
+        rows = torch.cat([torch.tensor(local[chosen], dtype=torch.float32), extra[chosen]], dim=1)
+    xyz = rows[:, :3].contiguous()
+    up = mlp(state, "roi_head.xyz_up_layer", rows[:, :5].T)
+    merged = mlp(state, "roi_head.merge_down_layer", torch.cat([up, rows[:, 5:].T]))
+    for k, level in enumerate([(128, (0.2,), (16,)), (32, (0.4,), (16,))]):
+        xyz, merged = set_abstraction(state, f"roi_head.SA_modules.{k}", xyz, merged, level)
+    described = mlp(state, "roi_head.SA_modules.2.mlps.0", torch.cat([xyz.T, merged])).amax(dim=1, keepdim=True)
+    out = []
+    for name in ("cls_layers", "reg_layers"):
+        hidden = described
+        for conv_index, norm_index in ((0, 1), (4, 5)):
+            hidden = dense(state, f"roi_head.{name}", conv_index, norm_index, hidden)
+        out.append(state[f"roi_head.{name}.7.weight"].flatten(1) @ hidden + state[f"roi_head.{name}.7.bias"][:, None])
+    code = out[1][:, 0].double().numpy()
+    diagonal = math.hypot(l, w)
+    dx, dy = code[0] * diagonal, code[1] * diagonal
+    centre = [x + dx * c - dy * s, y + dx * s + dy * c, z + code[2] * h]
+    sizes = np.exp(code[3:6]) * [l, w, h]
+    return float(out[0][0, 0]), np.array([*centre, *sizes, code[6] + heading])
+
+
+def dense(state: dict[str, Tensor], prefix: str, conv_index: int, norm_index: int, x: Tensor) -> Tensor:
+    """(C, N): convolution without bias, normalisation with running statistics, ReLU, named by index."""
+    y = state[f"{prefix}.{conv_index}.weight"].flatten(1) @ x
+    weight, bias, mean, var = (
+        state[f"{prefix}.{norm_index}.{part}"][:, None] for part in ("weight", "bias", "running_mean", "running_var")
+    )
+    return F.relu((y - mean) / (var + 1e-5).sqrt() * weight + bias)
