@@ -1,4 +1,4 @@
-"""From a training run to embedded weights: scores on held-out synthetic frames go into the card, files into the package.
+"""From a training run to embedded weights: held-out figures go into the card, files into the package.
 
     python -m pipeline.embedding completion RUN NAME --data HELD_OUT
     python -m pipeline.embedding detection RUN NAME --data HELD_OUT --cloud L
