@@ -159,8 +159,9 @@ def _strided_rulebook(sites: Sites, kernel: Triple, stride: Triple, padding: Tri
     if device.type == "cpu":
         found = _windows_cpu(sites, taps, steps, margins, out_shape)
     else:
-        moved = (value.to(device) for value in (taps, steps, margins))
-        found = _sparse_torch.window_pairs(sites.coords, *moved, out_shape)
+        found = _sparse_torch.window_pairs(
+            sites.coords, taps.to(device), steps.to(device), margins.to(device), out_shape
+        )
     keys, source, target, counts = found
     outputs = Sites(_sparse_torch.unravel(keys, out_shape), out_shape, sites.batch)
     return outputs, Rulebook(source, target, _starts(counts), len(sites), len(outputs), None)
