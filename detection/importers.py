@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from detection.models.lidar_presets import OPENPCDET_PRESETS, openpcdet_features
 from detection.models.openpcdet_pointrcnn import OpenPCDetPointRCNN
 from detection.models.presets import pointrcnn, pointrcnn2
 
@@ -188,11 +189,45 @@ def _openpcdet_pointrcnn(tensors: Mapping[str, Tensor]) -> nn.Module:
     return OpenPCDetPointRCNN()
 
 
+def _openpcdet(architecture: str) -> Callable[[Mapping[str, Tensor]], nn.Module]:
+    """The voxel detector with as many classes and point columns as the checkpoint's heads and first layer show."""
+
+    def build(tensors: Mapping[str, Tensor]) -> nn.Module:
+        scores = tensors.get("dense_head.conv_cls.weight")
+        # Anchors per cell (2 per class) times classes.
+        count = 3 if scores is None else round((scores.shape[0] / 2) ** 0.5)
+        classes = ("Car", "Pedestrian", "Cyclist")[:count]
+        return OPENPCDET_PRESETS[architecture](openpcdet_features(_point_channels(tensors)), classes).build()
+
+    return build
+
+
+def _point_channels(tensors: Mapping[str, Tensor]) -> int:
+    """Point channels of a voxel detector: pillars add six of their own, spconv's layouts differ in where they stand."""
+    pillars = tensors.get("vfe.pfn_layers.0.linear.weight")
+    if pillars is not None:
+        return int(pillars.shape[1]) - 6
+    first = tensors.get("backbone_3d.conv_input.0.weight")
+    if first is None or first.dim() != 5:
+        return 4
+    return int(first.shape[3] if first.shape[:3] == (3, 3, 3) else first.shape[4])
+
+
+def to_spconv2(tensors: Mapping[str, Tensor], model: nn.Module) -> dict[str, Tensor]:
+    """Sparse weights of spconv 1.x (kz, ky, kx, in, out) in 2.x's layout (out, kz, ky, kx, in), told apart by shape."""
+    own, found = model.state_dict(), dict(tensors)
+    for name, value in tensors.items():
+        if value.dim() == 5 and name in own and value.shape != own[name].shape:
+            found[name] = value.permute(4, 0, 1, 2, 3)
+    return found
+
+
 # Architecture -> the network that fits a checkpoint's shapes.
 BUILDERS: dict[str, Callable[[Mapping[str, Tensor]], nn.Module]] = {
     "pointrcnn": _pointrcnn,
     "epnet": _epnet,
     "openpcdet_pointrcnn": _openpcdet_pointrcnn,
+    **{architecture: _openpcdet(architecture) for architecture in OPENPCDET_PRESETS},
 }
 
 
@@ -205,14 +240,14 @@ def import_with_report(path: str | Path, architecture: str) -> tuple[nn.Module, 
         model = BUILDERS[architecture](tensors)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    return model.eval(), fill(model, tensors, path)
+    return model.eval(), fill(model, to_spconv2(tensors, model), path)
 
 
 def import_checkpoint(path: str | Path, architecture: str) -> nn.Module:
     """A network in eval mode filled with a public checkpoint.
 
     architecture  "pointrcnn" (52 or 76 first-stage channels, told apart by shape), "epnet" (fusion off),
-                  "openpcdet_pointrcnn"
+                  "openpcdet_pointrcnn", and OpenPCDet's "pointpillar", "second", "voxel_rcnn", "pv_rcnn"
     Raises ValueError when the file calls functions, is damaged, or does not fit; nothing in it is executed.
     """
     return import_with_report(path, architecture)[0]

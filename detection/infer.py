@@ -12,10 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from detection.boxes import from_lidar, wrap_angle
+from detection.boxes import wrap_angle
 from detection.checkpoints import import_checkpoint, load_checkpoint
 from detection.inputs import CameraCloud, camera_cloud, ground_height, lidar_input, mirrored, network_input
+from detection.lidar_inputs import all_points, from_turned
 from detection.models.batch import DetectorModel, PointBatch, RawDetections
+from detection.models.openpcdet_pointrcnn import to_camera_axes
 from detection.models.presets import IMPORTED_PRESETS, OutputSettings, Preset
 from detection.ops import iou_bev, nms_rotated
 from detection.types import Boxes3D, Detections, PointFrame
@@ -67,13 +69,20 @@ class Detector:
             return cast(DetectorModel, self.model).raw_detections(batch)[0]
 
     def _detect_in_lidar_frame(self, frame: PointFrame) -> Detections:
-        points = lidar_input(frame, self.preset.inputs.points, self._generator(frame.id, "straight"))
-        if not len(points):
+        inputs = self.preset.inputs
+        if inputs.sampler == "all":
+            full = all_points(frame, inputs.features)
+            points = full[:0]
+        else:
+            points = lidar_input(frame, inputs.points, self._generator(frame.id, "straight"))
+            full = points[:0]
+        if not len(points) + len(full):
             return Detections.empty()
-        raw = self._run(points, points[:0])
-        boxes = from_lidar(raw.boxes.double().cpu().numpy(), frame.T_cam_velo)
-        camera = RawDetections(torch.from_numpy(boxes.values), raw.logits, raw.classes)
-        return final_detections([camera], self.preset.outputs, self.preset.classes)
+        raw = self._run(points, full)
+        # The last suppression looks at boxes from above in the LiDAR frame, where the network found them.
+        turned = RawDetections(to_camera_axes(raw.boxes), raw.logits, raw.classes)
+        found = final_detections([turned], self.preset.outputs, self.preset.classes)
+        return Detections(from_turned(found.boxes.values, frame), found.classes, found.scores)
 
 
 def load_detector(path_or_name: str | Path, device: str = "cpu", seed: int = 0) -> Detector:
@@ -112,7 +121,7 @@ def final_detections(found: list[RawDetections], settings: OutputSettings, class
     usable &= torch.isfinite(boxes).all(dim=1)
     boxes, logits, labels = boxes[usable], logits[usable], labels[usable]
     groups = [labels == index for index in range(len(classes))] if settings.nms_per_class else [labels >= 0]
-    kept = torch.cat([_kept(boxes, logits, group, settings.nms_iou) for group in groups])
+    kept = torch.cat([_kept(boxes, logits, group, settings) for group in groups])
     kept = kept[logits[kept].argsort(descending=True, stable=True)]
     values = boxes[kept].numpy().copy()
     if settings.vote_iou < 1:
@@ -124,10 +133,10 @@ def final_detections(found: list[RawDetections], settings: OutputSettings, class
     return Detections(Boxes3D(values), tuple(classes[index] for index in labels[kept].tolist()), scores.numpy())
 
 
-def _kept(boxes: Tensor, logits: Tensor, group: Tensor, iou: float) -> Tensor:
+def _kept(boxes: Tensor, logits: Tensor, group: Tensor, settings: OutputSettings) -> Tensor:
     """Indices of the boxes of a group (P,) bool that survive rotated NMS."""
     index = group.nonzero().squeeze(1)
-    return index[nms_rotated(boxes[index], logits[index], iou)]
+    return index[nms_rotated(boxes[index], logits[index], settings.nms_iou, settings.limit)]
 
 
 def vote(kept: Tensor, boxes: Tensor, weights: Tensor, iou: float) -> Tensor:

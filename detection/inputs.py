@@ -136,7 +136,8 @@ class InputSettings:
     """How a cloud becomes the input of a network.
 
     points    points of the first stage
-    sampler   "near_far" (PointRCNN), "uniform" (thesis, dense clouds) or "balanced" (see `detection.sampling`)
+    sampler   "near_far" (PointRCNN), "uniform" (thesis, dense clouds) or "balanced" (see `detection.sampling`); "all"
+              points of the frame for the voxel detectors (see `detection.lidar_inputs`)
     features  columns beside x y z, of `FEATURES`
     cloud     most points kept of the full cloud for the second stage; 0 when it does not use it
     frame     "camera", or "lidar" for networks of OpenPCDet: input and output boxes are then in the LiDAR frame

@@ -35,6 +35,7 @@ from detection.augment import (
 from detection.checkpoints import load_checkpoint, load_tensors, save_checkpoint, save_tensors, write_atomically
 from detection.inputs import CameraCloud, camera_cloud, ground_height, network_input, truth_boxes
 from detection.kitti_format import KittiObject, boxes_of
+from detection.lidar_inputs import lidar_boxes, lidar_rows, turned_boxes, turned_cloud
 from detection.models.batch import DetectorModel, PointBatch
 from detection.models.layers import set_batchnorm_momentum
 from detection.models.presets import PRESETS, Preset
@@ -129,12 +130,15 @@ def frame_order(step: int, frames: int, settings: TrainSettings, rank: int, work
 
 
 def training_scene(frame: PointFrame, labels: Sequence[KittiObject], preset: Preset) -> TrainingScene:
-    """The visible points, their heights and the boxes of one frame, in the camera frame."""
-    cloud = camera_cloud(frame)
+    """The visible points, their heights and the boxes of one frame, in the camera frame (or turned LiDAR axes)."""
     truth = truth_boxes(labels, preset.classes)
-    solid = [item for item in labels if item.type != "DontCare" and min(item.size) > 0]
+    obstacles = boxes_of([item for item in labels if item.type != "DontCare" and min(item.size) > 0]).values
+    cloud, boxes = camera_cloud(frame), truth.boxes
+    if preset.inputs.frame == "lidar":
+        cloud = turned_cloud(frame)
+        boxes, obstacles = turned_boxes(boxes, frame), turned_boxes(obstacles, frame)
     points = np.concatenate([cloud.xyz, cloud.columns], axis=1)
-    return TrainingScene(points, ground_height(cloud.xyz), truth.boxes, truth.classes, boxes_of(solid).values)
+    return TrainingScene(points, ground_height(cloud.xyz), boxes, truth.classes, obstacles)
 
 
 def object_database(samples: LabelledFrames, preset: Preset, settings: TrainSettings) -> list[DatabaseObject]:
@@ -180,6 +184,9 @@ def prepare_sample(
     if settings.scene is not None:
         scene = augment_scene(scene, settings.scene, rng)
     cloud = CameraCloud(scene.points[:, :3], scene.points[:, 3:])
+    if preset.inputs.frame == "lidar":
+        rows = rng.permutation(lidar_rows(cloud, scene.height, preset.inputs.features))
+        return _Prepared(rows[:0], rows, lidar_boxes(scene.boxes), scene.classes)
     points, full = network_input(cloud, scene.height, preset.inputs, rng)
     return _Prepared(points, full, scene.boxes, scene.classes)
 
@@ -229,7 +236,8 @@ class Trainer:
         seeds = np.random.SeedSequence([self.settings.seed, 4, step, self.workers.rank])
         torch.manual_seed(int(seeds.generate_state(1, np.uint64)[0] >> 1))
         self.model.train()
-        set_batchnorm_momentum(self.model, batchnorm_momentum(step, self.epoch_steps))
+        if self.preset.norm_schedule:
+            set_batchnorm_momentum(self.model, batchnorm_momentum(step, self.epoch_steps))
         losses = cast(DetectorModel, self.model).training_losses(batch, np.random.default_rng(seeds.spawn(1)[0]))
         if not bool(torch.isfinite(losses["loss"])):
             raise ValueError(f"training: the loss is not finite at step {step + 1}; lower optimiser.peak")

@@ -11,11 +11,12 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class PointBatch:
-    """B frames in the rectified camera frame (x right, y down, z forward, metres).
+    """B frames in the rectified camera frame (x right, y down, z forward, metres); voxel detectors: LiDAR frame.
 
     points   (B, N, 3 + E) sampled points with the model's extra channels
-    clouds   B tensors (M_i, 3 + E): all points of each frame, shuffled; the second stage of `small` pools from them
-    boxes    B tensors (G_i, 7) ground truth x y z h w l ry; empty at test time
+    clouds   B tensors (M_i, 3 + E): all points of each frame, shuffled; the second stage of `small` pools from
+             them, voxel detectors see nothing else
+    boxes    B tensors (G_i, 7) ground truth x y z h w l ry (LiDAR: x y z centre, l w h, heading); none at test time
     classes  B tensors (G_i,) int64, 1 = first class of the model
     """
 

@@ -3,58 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, cast
 
 from torch import nn
 
 from detection.inputs import InputSettings
 from detection.models.compact import CLASSES, CompactPointRCNN, CompactSettings
+from detection.models.lidar_presets import LIDAR_PRESETS, OPENPCDET_PRESETS, openpcdet_features
 from detection.models.openpcdet_pointrcnn import OpenPCDetPointRCNN
 from detection.models.pointrcnn import PointRCNN, PointRCNNSettings
+from detection.models.preset import OutputSettings, Preset
 from detection.models.proposals import ProposalSettings
 from detection.targets import RoiSamplingSettings
 
 # Values of the released configurations of PointRCNN and EPNet.
 _NEAR_FAR_TRAIN = ProposalSettings(before=9000, after=512, iou=0.85, by_distance=True, rotated=False)
 _NEAR_FAR_TEST = ProposalSettings(before=9000, after=100, iou=0.8, by_distance=True, rotated=False)
-
-
-@dataclass(frozen=True)
-class OutputSettings:
-    """From refined boxes to detections.
-
-    score_threshold  on the sigmoid of the score
-    nms_iou          rotated BEV IoU above which the lower score is suppressed
-    nms_per_class    only within a class; else over all boxes (OpenPCDet)
-    probability      detections carry the sigmoid; else the raw logit, as the reference's result files do
-    mirrored_pass    detect on the mirrored cloud as well and pool the boxes
-    vote_iou         boxes of a class that overlap a kept one by more are averaged with it by score; 1 = no voting
-    """
-
-    score_threshold: float
-    nms_iou: float = 0.1
-    probability: bool = False
-    mirrored_pass: bool = False
-    vote_iou: float = 1.0
-    nms_per_class: bool = True
-
-
-@dataclass(frozen=True)
-class Preset:
-    """A detector by name.
-
-    options  arguments that rebuild it: PRESETS[name](**options)
-    skip_empty_frames  training leaves out frames without a box of the classes, as PointRCNN does
-    """
-
-    name: str
-    classes: tuple[str, ...]
-    inputs: InputSettings
-    outputs: OutputSettings
-    build: Callable[[], nn.Module]
-    options: dict[str, Any] = field(default_factory=dict)
-    skip_empty_frames: bool = True
 
 
 def small(features: tuple[str, ...] = ("height", "range"), points: int = 8192, width: float = 1.0) -> Preset:
@@ -151,6 +116,7 @@ PRESETS: dict[str, Callable[..., Preset]] = {
     "pointrcnn": pointrcnn,
     "pointrcnn2": pointrcnn2,
     "thesis": thesis,
+    **LIDAR_PRESETS,
 }
 
 
@@ -171,9 +137,21 @@ def _openpcdet_pointrcnn(model: nn.Module) -> Preset:
     )
 
 
+def _fitting_openpcdet(architecture: str) -> Callable[[nn.Module], Preset]:
+    """The preset of a voxel detector, with the classes and point columns the imported network has."""
+
+    def fitting(model: nn.Module) -> Preset:
+        settings = cast(Any, model).settings
+        features = openpcdet_features(settings.point_channels)
+        return OPENPCDET_PRESETS[architecture](features, [kind.name for kind in settings.classes])
+
+    return fitting
+
+
 # Architecture of an imported checkpoint -> the preset that runs its network.
 IMPORTED_PRESETS: dict[str, Callable[[nn.Module], Preset]] = {
     "pointrcnn": _fitting_pointrcnn,
     "epnet": _fitting_epnet,
     "openpcdet_pointrcnn": _openpcdet_pointrcnn,
+    **{architecture: _fitting_openpcdet(architecture) for architecture in OPENPCDET_PRESETS},
 }
