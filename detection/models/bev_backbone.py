@@ -25,6 +25,10 @@ class BevSettings:
         """Channels of the concatenated map."""
         return sum(self.up_channels)
 
+    def cells(self, before: int) -> int:
+        """Cells along an axis of the concatenated map, from those of the input map."""
+        return ((before - 1) // self.strides[0] + 1) * self.up_strides[0]
+
 
 def _block(in_channels: int, channels: int, stride: int, layers: int) -> nn.Sequential:
     """Padding at index 0, then convolution, normalisation, ReLU at 1 2 3, 4 5 6, ..."""

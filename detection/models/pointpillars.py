@@ -69,7 +69,7 @@ class PointPillars(nn.Module):
         self.vfe = PillarEncoder(grid, settings.point_channels, settings.pillar_channels)
         self.backbone_2d = BevBackbone(settings.pillar_channels, bev)
         _, height, width = grid.shape
-        cells = _after(height, bev), _after(width, bev)
+        cells = bev.cells(height), bev.cells(width)
         self.dense_head = AnchorHead(bev.out_channels, settings.classes, grid.low, grid.high, cells)
 
     def forward(self, clouds: Sequence[Tensor]) -> SingleStage:
@@ -88,8 +88,3 @@ class PointPillars(nn.Module):
     def raw_detections(self, batch: PointBatch) -> list[RawDetections]:
         """The best anchors of each frame, LiDAR form."""
         return best_anchors(self(batch.clouds))
-
-
-def _after(cells: int, bev: BevSettings) -> int:
-    """Cells along an axis of the map after the 2D backbone: 3x3 convolutions with padding 1, then upsampling."""
-    return ((cells - 1) // bev.strides[0] + 1) * bev.up_strides[0]

@@ -51,9 +51,8 @@ class VoxelTrunk(nn.Module):
         self.backbone_3d = VoxelBackbone(settings.point_channels, settings.widths)
         self.backbone_2d = BevBackbone(bev_channels(grid, settings.widths), bev)
         _, height, width = grid.shape
-        self.dense_head = AnchorHead(
-            bev.out_channels, settings.classes, grid.low, grid.high, (height // STRIDE, width // STRIDE)
-        )
+        cells = bev.cells(height // STRIDE), bev.cells(width // STRIDE)
+        self.dense_head = AnchorHead(bev.out_channels, settings.classes, grid.low, grid.high, cells)
 
     def first_stage(self, clouds: Sequence[Tensor]) -> tuple[VoxelLevels, SingleStage]:
         """Clouds of B frames, each (N_i, 3 + E) -> levels of the sparse backbone and the anchors' boxes."""
