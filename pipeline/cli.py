@@ -87,7 +87,12 @@ def _evaluates_a_run(arguments: Sequence[str]) -> bool:
 
 
 def _run_verb(verb: str, arguments: Sequence[str], about: str) -> int:
-    module = verb_module(verb)
+    result: int = verb_module(verb).run(verb_parser(verb, about).parse_args(arguments))
+    return result
+
+
+def verb_parser(verb: str, about: str) -> argparse.ArgumentParser:
+    """The options of a verb."""
     parser = argparse.ArgumentParser(
         prog=f"run_pipeline --stage {verb}",
         description=about,
@@ -95,9 +100,8 @@ def _run_verb(verb: str, arguments: Sequence[str], about: str) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--stage", help=argparse.SUPPRESS)
-    module.add_arguments(parser)
-    result: int = module.run(parser.parse_args(arguments))
-    return result
+    verb_module(verb).add_arguments(parser)
+    return parser
 
 
 def main_parser(verbs: dict[str, str]) -> argparse.ArgumentParser:
