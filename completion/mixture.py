@@ -39,12 +39,21 @@ def expected_depth(mixture: Tensor) -> Tensor:
 
 def quantiles(mixture: Tensor, shares: tuple[float, ...]) -> list[Tensor]:
     """Each (B, 1, H, W) metres: the candidate at which the cumulated weight reaches the share. 0.5 is the median."""
+    return [torch.exp(log_depth) for log_depth in _log_quantiles(mixture, shares)]
+
+
+def _log_quantiles(mixture: Tensor, shares: tuple[float, ...]) -> list[Tensor]:
     logits, log_depths, _ = split_mixture(mixture)
     ordered, order = log_depths.sort(1)
     cumulated = torch.softmax(logits, 1).gather(1, order).cumsum(1)
     last = ordered.shape[1] - 1
-    picks = [(cumulated < share).sum(1, keepdim=True).clamp(max=last) for share in shares]
-    return [torch.exp(ordered.gather(1, pick)) for pick in picks]
+    return [ordered.gather(1, (cumulated < share).sum(1, keepdim=True).clamp(max=last)) for share in shares]
+
+
+def surface_shares(gamma: float) -> tuple[float, float]:
+    """The shares of the foreground's and the background's quantile: 1 / (1 + gamma^2) and gamma^2 / (1 + gamma^2)."""
+    low = 1 / (1 + gamma**2)
+    return low, 1 - low
 
 
 def twin_surfaces(mixture: Tensor, gamma: float = 2.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -52,9 +61,10 @@ def twin_surfaces(mixture: Tensor, gamma: float = 2.0) -> tuple[Tensor, Tensor, 
 
     sigma is the probability that the depth lies nearer to the foreground than to the background (in log depth).
     """
-    low = 1 / (1 + gamma**2)
-    foreground, median, background = quantiles(mixture, (low, 0.5, 1 - low))
+    low, high = surface_shares(gamma)
+    foreground, median, background = _log_quantiles(mixture, (low, 0.5, high))
     logits, log_depths, _ = split_mixture(mixture)
-    middle = 0.5 * (torch.log(foreground) + torch.log(background))
-    sigma = (torch.softmax(logits, 1) * (log_depths <= middle)).sum(1, keepdim=True)
-    return foreground, background, sigma.clamp(0, 1), median
+    # In log depth, not from metres: where both surfaces are one candidate, rounding must not leave it out.
+    nearer = log_depths <= 0.5 * (foreground + background)
+    sigma = (torch.softmax(logits, 1) * nearer).sum(1, keepdim=True).clamp(0, 1)
+    return torch.exp(foreground), torch.exp(background), sigma, torch.exp(median)

@@ -11,7 +11,6 @@ from torch import nn
 
 from completion.depth_coefficients import Bins
 from completion.models.coefficients import CoefficientNetwork, CoefficientSparseToDense
-from completion.models.guided import Guided
 from completion.models.hourglass import MultiStack, Twise
 from completion.models.selection import Selection
 from completion.models.sparse_to_dense import SparseToDense, TwinSparseToDense
@@ -83,7 +82,6 @@ MODELS: dict[str, Entry] = {
         partial(CoefficientSparseToDense, coefficient_input=False), 1.0, "unit", "coefficients", 16
     ),
     "resnet_dc_to_dc": Entry(CoefficientSparseToDense, 1.0, "unit", "coefficients", 16),
-    "guided": Entry(Guided, 1.0, "standardised", "twin", 64),
     "selection": Entry(Selection, 1.0, "standardised", "mixture", 32),
 }
 

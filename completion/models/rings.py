@@ -64,7 +64,7 @@ def _sweep(sparse, depth, cost):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _enclose(sparse):  # type: ignore[no-untyped-def]
+def enclose(sparse):  # type: ignore[no-untyped-def]
     """(H, W) float32 sparse depth -> (5, H, W): above, below, between, distance above, distance below."""
     height, width = sparse.shape
     out = np.empty((5, height, width), dtype=np.float32)
@@ -86,7 +86,7 @@ def _enclose(sparse):  # type: ignore[no-untyped-def]
 
 def interpolate_rings(sparse: NDArray[np.float32]) -> NDArray[np.float32]:
     """Sparse (H, W) float32 metres (0 = none) -> dense (H, W): `Rings.between`. A baseline without weights."""
-    dense: NDArray[np.float32] = _enclose(np.ascontiguousarray(sparse, dtype=np.float32))[2]
+    dense: NDArray[np.float32] = enclose(np.ascontiguousarray(sparse, dtype=np.float32))[2]
     return dense
 
 
@@ -95,6 +95,6 @@ def find_rings(sparse: Tensor) -> Rings:
 
     Computed on the CPU (about 5 ms for 375 x 1242); without gradient.
     """
-    maps = np.stack([_enclose(np.ascontiguousarray(one)) for one in sparse[:, 0].detach().float().cpu().numpy()])
+    maps = np.stack([enclose(np.ascontiguousarray(one)) for one in sparse[:, 0].detach().float().cpu().numpy()])
     tensor = torch.from_numpy(maps).to(sparse.device)
     return Rings(*(tensor[:, channel : channel + 1] for channel in range(5)))

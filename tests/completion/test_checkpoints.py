@@ -16,7 +16,7 @@ from completion.resume import load_state
 
 @pytest.fixture
 def saved(tmp_path: Path) -> Path:
-    spec = default_spec("guided", width=8)
+    spec = default_spec("selection", width=8)
     return save_checkpoint(tmp_path / "net.safetensors", build_model(spec), Card(spec, "hard", {"seed": 3}))
 
 
@@ -98,7 +98,7 @@ def test_wrong_specifications_are_named() -> None:
 
 
 def test_a_checkpoint_is_no_training_state(saved: Path) -> None:
-    model = build_model(default_spec("guided", width=8))
+    model = build_model(default_spec("selection", width=8))
     optimiser = torch.optim.Adam(model.parameters())
     with pytest.raises(CheckpointError, match="state of a training run"):
         load_state(saved, model, optimiser, torch.amp.GradScaler("cpu", enabled=False))

@@ -139,7 +139,7 @@ def test_skips_are_linear_features() -> None:
     assert all(float(f.min()) < 0 for f in features)
 
 
-@pytest.mark.parametrize("architecture", ["twise", "msg_chn", "guided"])
+@pytest.mark.parametrize("architecture", ["twise", "msg_chn", "selection"])
 def test_without_any_sample_the_result_is_finite(architecture: str) -> None:
     model = build_model(default_spec(architecture)).eval()
     with torch.inference_mode():

@@ -19,7 +19,7 @@ from tests.completion.scenes import street
 SMALL = {
     "twise": {"channels": 4},
     "msg_chn": {"channels": 4},
-    "guided": {"width": 8},
+    "selection": {"width": 8},
     "twise_resnet": {},
     "depth_coefficients": {"count": 8, "size": 10.0},
 }
@@ -28,7 +28,7 @@ SMALL = {
 def completer(architecture: str, rows: int | None = None) -> NetworkCompleter:
     torch.manual_seed(0)
     spec = default_spec(architecture, **SMALL[architecture])
-    read_out = {"depth": "depth", "coefficients": "peak", "twin": "fused"}[spec.output]
+    read_out = {"depth": "depth", "coefficients": "peak", "twin": "fused", "mixture": "median"}[spec.output]
     return NetworkCompleter(build_model(spec), spec, read_out=read_out, rows=rows)
 
 
@@ -38,7 +38,7 @@ def test_any_size(architecture: str, size: tuple[int, int]) -> None:
     frame = street(1, *size)
     found = completer(architecture).complete(frame.sparse, frame.image)
     assert found.size == size
-    assert found.has_surfaces == (architecture in ("twise", "guided", "twise_resnet"))
+    assert found.has_surfaces == (architecture in ("twise", "selection", "twise_resnet"))
 
 
 @pytest.mark.parametrize("architecture", sorted(SMALL))
@@ -77,7 +77,7 @@ def test_bottom_rows_only() -> None:
 
 def test_a_batch_is_its_frames() -> None:
     frames = [street(i, 48, 64) for i in range(3)]
-    found = completer("guided")
+    found = completer("selection")
     together = found.complete_batch(frames)
     for one, frame in zip(together, frames):
         np.testing.assert_allclose(one.depth, found.complete(frame.sparse, frame.image).depth, rtol=1e-4, atol=1e-4)
@@ -87,7 +87,7 @@ def test_a_batch_is_its_frames() -> None:
 
 
 def test_loading_by_path(tmp_path: Path) -> None:
-    spec = default_spec("guided", width=8)
+    spec = default_spec("selection", width=8)
     model = build_model(spec)
     path = save_checkpoint(tmp_path / "net", model, Card(spec, "hard"))
     frame = street(6, 64, 96)

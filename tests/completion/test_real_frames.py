@@ -30,7 +30,7 @@ def test_linear_interpolation_beats_nearest_on_held_out_samples(kitti_object: Pa
 def test_a_network_completes_a_real_frame_at_full_size(kitti_object: Path) -> None:
     frame = open_dataset("kitti_object", kitti_object)["000003"]
     torch.manual_seed(0)
-    spec = default_spec("guided", width=8)
+    spec = default_spec("selection", width=8)
     completed = NetworkCompleter(build_model(spec), spec, read_out="hard").complete(frame.sparse_depth, frame.image)
     assert completed.size == frame.image.shape[:2]
     measured = frame.sparse_depth > 0

@@ -36,7 +36,7 @@ def run(out: Path, architecture: str, kill_at: int = 0) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("architecture", ["guided", "twise"])
+@pytest.mark.parametrize("architecture", ["selection", "twise"])
 def test_killed_twice_and_resumed_gives_the_same_bits(tmp_path: Path, architecture: str) -> None:
     assert run(tmp_path / "whole", architecture) == 0
     assert run(tmp_path / "killed", architecture, kill_at=11) == -signal.SIGKILL
@@ -49,9 +49,9 @@ def test_killed_twice_and_resumed_gives_the_same_bits(tmp_path: Path, architectu
 @pytest.mark.slow
 def test_two_processes_take_the_steps_of_one(tmp_path: Path) -> None:
     """torchrun with two CPU processes of one sample each equals one process that accumulates two."""
-    assert run(tmp_path / "one", "guided") == 0
+    assert run(tmp_path / "one", "selection") == 0
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    command = [*torchrun, "-m", "tests.completion.training_run", str(tmp_path / "two"), "guided", "0"]
+    command = [*torchrun, "-m", "tests.completion.training_run", str(tmp_path / "two"), "selection", "0"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     one, two = load_file(tmp_path / "one/last.safetensors"), load_file(tmp_path / "two/last.safetensors")
@@ -61,7 +61,7 @@ def test_two_processes_take_the_steps_of_one(tmp_path: Path) -> None:
 
 
 def test_stopping_by_time_and_going_on(tmp_path: Path) -> None:
-    whole = replace(settings("guided"), max_steps=5, validate_every=0)
+    whole = replace(settings("selection"), max_steps=5, validate_every=0)
     first = train(whole, Streets(11, 64, 96), tmp_path / "run", seconds=0.0)
     assert load_checkpoint(first)[1].training["step"] == 1
     last = train(whole, Streets(11, 64, 96), tmp_path / "run")
@@ -71,7 +71,7 @@ def test_stopping_by_time_and_going_on(tmp_path: Path) -> None:
 
 
 def test_a_run_goes_on_only_under_its_own_settings(tmp_path: Path) -> None:
-    short = replace(settings("guided"), max_steps=2)
+    short = replace(settings("selection"), max_steps=2)
     train(short, Streets(3, 64, 96), tmp_path)
     with pytest.raises(ValueError, match="other settings"):
         train(replace(short, seed=1), Streets(3, 64, 96), tmp_path)

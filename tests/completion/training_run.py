@@ -17,7 +17,7 @@ from completion.samples import Augmentation, TrainingSample
 from completion.train import TrainSettings, train
 from tests.completion.scenes import Streets, street
 
-ARGUMENTS = {"twise": {"channels": 4}, "guided": {"width": 8}}
+ARGUMENTS = {"twise": {"channels": 4}, "selection": {"width": 8}}
 
 
 class Mortal(Streets):

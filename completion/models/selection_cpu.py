@@ -1,0 +1,247 @@
+"""What surrounds the convolutions of `selection.Selection`, for inference on the CPU: the same values, much faster.
+
+Two passes over the image with numba instead of some eighty tensor operations. Both work on runs of pixels of one row
+that fit the first-level cache, in plain loops the compiler turns into vector instructions; that is why the exponential
+is written out here. Rows are shared among as many threads as torch uses.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+from numba import njit
+from numpy.typing import NDArray
+from torch import Tensor
+
+from completion.inputs import scale_rgb
+from completion.mixture import surface_shares
+from completion.models.rings import enclose
+from completion.models.selection import CANDIDATES, CHANNELS, COLUMN_SHIFTS, Selection
+from completion.twin_surface import fuse
+
+Float = NDArray[np.float32]
+INPUTS = 10
+GAMMA = 2.0
+_RUN = 128  # pixels
+_MEASURED = CANDIDATES - 1
+_ONE, _TWO, _HALF, _ZERO = np.float32(1), np.float32(2), np.float32(0.5), np.float32(0)
+_LOG2_E, _ROUND = np.float32(1 / math.log(2)), np.float32(128.5)
+_LN2_HIGH, _LN2_LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
+_LEAST, _MOST = np.float32(-86), np.float32(86)
+_TAYLOR = tuple(np.float32(1 / math.factorial(n)) for n in range(8))
+
+
+@njit(inline="always")
+def _exp(x):  # type: ignore[no-untyped-def]
+    """Float32 exponential to 2e-7 relative, cut at exp(+-86): 2^n times a Taylor polynomial on +-ln(2) / 2."""
+    x = _LEAST if x < _LEAST else x
+    x = _MOST if x > _MOST else x
+    n = np.int32(np.int32(x * _LOG2_E + _ROUND) - np.int32(128))
+    whole = np.float32(n)
+    r = x - whole * _LN2_HIGH - whole * _LN2_LOW
+    p = _TAYLOR[6] + r * _TAYLOR[7]
+    p = _TAYLOR[4] + r * (_TAYLOR[5] + r * p)
+    p = _TAYLOR[2] + r * (_TAYLOR[3] + r * p)
+    p = _ONE + r * (_ONE + r * p)
+    return p * np.int32(np.int32(n + np.int32(127)) << np.int32(23)).view(np.float32)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _write_inputs(first, last, image, colours, sparse, rings, logs, out):  # type: ignore[no-untyped-def]
+    """Network inputs of half-resolution rows first..last; see `selection.depth_features` and torch's pixel_unshuffle.
+
+    image (H, W, 3) uint8, colours (3, 256) their scaled values, rings (5, H, W), logs (3, H, W) natural logarithms of
+    the first three rings, out (H/2, W/2, 40)
+    """
+    height, width = sparse.shape
+    for y in range(2 * first, 2 * last):
+        row = np.float32(2 * y / (height - 1) - 1)
+        for x in range(width):
+            corner = 2 * (y % 2) + x % 2
+            pixel = out[y // 2, x // 2]
+            for c in range(3):
+                pixel[4 * c + corner] = colours[c, image[y, x, c]]
+            between = logs[2, y, x]
+            pixel[12 + corner] = between - np.float32(2.7)
+            for side in range(2):
+                difference = np.float32(3) * (logs[side, y, x] - between)
+                pixel[16 + 4 * side + corner] = min(max(difference, np.float32(-3)), np.float32(3))
+                pixel[24 + 4 * side + corner] = rings[3 + side, y, x] * np.float32(0.0625) - _ONE
+            pixel[32 + corner] = _ONE if sparse[y, x] > 0 else _ZERO
+            pixel[36 + corner] = row
+
+
+@njit(inline="always")
+def _gather(head, y, start, count, weights, depths):  # type: ignore[no-untyped-def]
+    """Logits and corrections of `count` pixels of row y from column `start` (even): undoes the pixel shuffle."""
+    corner = 2 * (y % 2)
+    for i in range(0, count, 2):
+        pixel = head[y // 2, (start + i) // 2]
+        for k in range(CANDIDATES):
+            for side in range(2):
+                weights[k, i + side] = pixel[4 * k + corner + side]
+                depths[k, i + side] = pixel[4 * (CANDIDATES + k) + corner + side]
+
+
+@njit(inline="always")
+def _candidates(logs, y, start, shifts, residual, depths):  # type: ignore[no-untyped-def]
+    """Corrections (K, n), in place -> natural logarithms of the candidates' depths."""
+    width = logs.shape[2]
+    for s in range(len(shifts)):
+        for r in range(3):
+            own = depths[3 * s + r]
+            for i in range(_RUN):
+                tanh = _ONE - _TWO / (_exp(_TWO * own[i]) + _ONE)
+                own[i] = residual * tanh
+            for i in range(_RUN):
+                own[i] += logs[r, y, min(max(start + i + shifts[s], 0), width - 1)]
+    for i in range(_RUN):
+        depths[_MEASURED, i] += logs[2, y, min(start + i, width - 1)]
+
+
+@njit(inline="always")
+def _softmax(weights, top):  # type: ignore[no-untyped-def]
+    for i in range(_RUN):
+        top[i] = weights[0, i]
+    for k in range(1, CANDIDATES):
+        for i in range(_RUN):
+            top[i] = weights[k, i] if weights[k, i] > top[i] else top[i]
+    for k in range(CANDIDATES):
+        for i in range(_RUN):
+            weights[k, i] = _exp(weights[k, i] - top[i])
+    top[:] = _ZERO
+    for k in range(CANDIDATES):
+        for i in range(_RUN):
+            top[i] += weights[k, i]
+    for k in range(CANDIDATES):
+        for i in range(_RUN):
+            weights[k, i] /= top[i]
+
+
+@njit(inline="always")
+def _cumulate(weights, depths, cumulated):  # type: ignore[no-untyped-def]
+    """cumulated[k]: the weight of all candidates not behind candidate k. Comparing all pairs needs no branch, unlike
+    sorting."""
+    for k in range(CANDIDATES):
+        for i in range(_RUN):
+            cumulated[k, i] = weights[k, i]
+    for k in range(1, CANDIDATES):
+        for j in range(k):
+            for i in range(_RUN):
+                behind = depths[j, i] <= depths[k, i]
+                cumulated[k, i] += weights[j, i] if behind else _ZERO
+                cumulated[j, i] += _ZERO if behind else weights[k, i]
+
+
+@njit(inline="always")
+def _quantile(depths, cumulated, share, out):  # type: ignore[no-untyped-def]
+    """The nearest candidate whose cumulated weight reaches the share."""
+    out[:] = np.float32(np.inf)
+    for k in range(CANDIDATES):
+        for i in range(_RUN):
+            reached = depths[k, i] if cumulated[k, i] >= share else np.float32(np.inf)
+            out[i] = reached if reached < out[i] else out[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _read_rows(first, last, head, logs, top, shifts, residual, shares, expected, out):  # type: ignore[no-untyped-def]
+    """Rows first..last of out (4, h, w): depth, foreground, background, sigma.
+
+    head (H/2, W/2, 84), logs (3, H, W); the image begins at row `top`; shares of foreground, median, background;
+    depth is the mean when `expected`, else the median.
+    """
+    weights = np.zeros((CANDIDATES, _RUN), np.float32)
+    depths = np.zeros((CANDIDATES, _RUN), np.float32)
+    cumulated = np.empty((CANDIDATES, _RUN), np.float32)
+    found = np.empty((4, _RUN), np.float32)
+    width = out.shape[2]
+    for y in range(first, last):
+        for start in range(0, width, _RUN):
+            count = min(_RUN, width - start)
+            _gather(head, y + top, start, min(_RUN, logs.shape[2] - start), weights, depths)
+            _candidates(logs, y + top, start, shifts, residual, depths)
+            _softmax(weights, found[0])
+            _cumulate(weights, depths, cumulated)
+            for s in range(3):
+                _quantile(depths, cumulated, shares[s], found[s])
+            found[3] = _ZERO
+            for k in range(CANDIDATES):
+                for i in range(_RUN):
+                    nearer = depths[k, i] <= _HALF * (found[0, i] + found[2, i])
+                    found[3, i] += weights[k, i] if nearer else _ZERO
+            if expected:
+                cumulated[0] = _ZERO
+                for k in range(CANDIDATES):
+                    for i in range(_RUN):
+                        cumulated[0, i] += weights[k, i] * _exp(depths[k, i])
+            for i in range(_RUN):
+                cumulated[1, i] = _exp(found[1, i])
+                found[0, i] = _exp(found[0, i])
+                found[2, i] = _exp(found[2, i])
+            for i in range(count):
+                out[0, y, start + i] = cumulated[0, i] if expected else cumulated[1, i]
+                out[1, y, start + i] = found[0, i]
+                out[2, y, start + i] = found[2, i]
+                out[3, y, start + i] = found[3, i] if found[3, i] < _ONE else _ONE
+
+
+def _in_threads(kernel: Callable[..., None], rows: int, *arguments: object) -> None:
+    """kernel(first, last, ...) over all rows, in as many threads as torch uses."""
+    threads = max(1, min(torch.get_num_threads(), rows))
+    if threads == 1:
+        kernel(0, rows, *arguments)
+        return
+    edges = [rows * part // threads for part in range(threads + 1)]
+    with ThreadPoolExecutor(threads) as pool:
+        for done in [pool.submit(kernel, a, b, *arguments) for a, b in zip(edges, edges[1:])]:
+            done.result()
+
+
+def complete_mixture(
+    model: Selection,
+    convolutions: Callable[[Tensor], Tensor],
+    sparse: Float,
+    image: NDArray[np.uint8],
+    scaling: str,
+    read_out: str,
+) -> tuple[Float, Float, Float, Float]:
+    """Sparse (h, w) metres and image (h, w, 3) of any size -> depth, foreground, background, sigma, each (h, w).
+
+    convolutions  (1, 40, H/2, W/2) -> (1, 84, H/2, W/2): `model.network.at_half` or an export of it
+    scaling       of the colours, see `inputs.scale_rgb`
+    read_out      one of `readout.MIXTURE_READ_OUTS`
+    """
+    height, width = sparse.shape
+    top, right = -height % 32, -width % 32
+    padded = np.pad(sparse, ((top, 0), (0, right)))
+    pixels = np.pad(image, ((top, 0), (0, right), (0, 0)), mode="edge")
+    rings = enclose(padded)
+    logs = np.log(rings[:3])
+    levels = torch.arange(256, dtype=torch.float32).expand(1, 3, 1, 256)
+    colours = scale_rgb(levels, scaling)[0, :, 0].contiguous().numpy()
+    features = np.empty((padded.shape[0] // 2, padded.shape[1] // 2, 4 * INPUTS), np.float32)
+    _in_threads(_write_inputs, len(features), pixels, colours, padded, rings, logs, features)
+    head = convolutions(torch.from_numpy(features).permute(2, 0, 1)[None])
+    assert head.shape[1] == 4 * CHANNELS, head.shape
+    low, high = surface_shares(GAMMA)
+    out = np.empty((4, height, width), np.float32)
+    _in_threads(
+        _read_rows,
+        height,
+        head[0].float().permute(1, 2, 0).contiguous().numpy(),
+        logs,
+        top,
+        np.array(COLUMN_SHIFTS),
+        np.float32(model.residual),
+        np.array((low, 0.5, high), np.float32),
+        read_out == "expected",
+        out,
+    )
+    depth, foreground, background, sigma = out
+    if read_out not in ("median", "expected"):
+        depth = fuse(foreground, background, sigma, read_out)
+    return depth, foreground, background, sigma
