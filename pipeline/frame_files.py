@@ -135,6 +135,15 @@ def content_hash(data: bytes) -> str:
     return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 
+def file_content_hash(path: Path) -> str:
+    """`content_hash` of a file, read in pieces. Raises OSError when it cannot be read."""
+    digest = hashlib.blake2b(digest_size=16)
+    with open(path, "rb") as file:
+        while piece := file.read(1 << 20):
+            digest.update(piece)
+    return digest.hexdigest()
+
+
 def npz_bytes(arrays: dict[str, NDArray[Any]]) -> bytes:
     """A compressed .npz whose bytes depend on the arrays alone (no time stamps), readable by `numpy.load`."""
     buffer = io.BytesIO()

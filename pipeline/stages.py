@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pipeline.config import Config
 from pipeline.data import Dataset, Frame, open_dataset
 from pipeline.data.depth_png import read_depth_png
-from pipeline.errors import UsageError
+from pipeline.errors import DataError, UsageError
 from pipeline.frame_files import FrameFiles
 from pipeline.paths import RunFolder
 from pipeline.runner.seeds import derive_seed
@@ -70,6 +70,9 @@ def prepare_complete(config: Config) -> FrameFunction:
 
     def complete(frame: Frame, files: FrameFiles) -> None:
         camera = frame.calibration.K if frame.has("calibration") else None
+        if frame.has("points") and not frame.sparse_depth.any():
+            where = next(iter(frame.files("points")), frame.where)
+            raise DataError(where, "points in the image", "no pixel has a value", "does the calibration fit?")
         files.write_completed(completer.complete(frame.sparse_depth, frame.image, camera))
 
     return complete
@@ -145,6 +148,8 @@ def completed_depth(config: Config, frame: Frame, files: FrameFiles) -> Complete
 
     path = Path(config.augment.depth_from) / f"{frame.id}.png"
     depth = read_depth_png(path)
+    if not depth.any():
+        raise DataError(path, "a depth map with values", "no pixel has a value")
     if depth.shape != tuple(frame.image_size):
         depth = placed_bottom_centre(depth, frame.image_size, path)
     return CompletedDepth(depth)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.data.files import read_text
 from pipeline.errors import DataError
 
 Array = NDArray[np.float64]
@@ -20,6 +21,10 @@ Array = NDArray[np.float64]
 # The same matrix under the names that the object, tracking and odometry benchmarks give it.
 _RECTIFICATION_KEYS = ("R0_rect", "R_rect", "R_rect_00")
 _VELO_KEYS = ("Tr_velo_to_cam", "Tr_velo_cam", "Tr")
+
+
+# Far beyond any camera: a focal length of 1e6 pixels, a sensor 1e6 m away.
+_MAX_ENTRY, _MAX_CONDITION = 1e6, 1e9
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,11 @@ class Calibration:
             object.__setattr__(self, name, matrix)
         if self.P2[0, 0] <= 0 or self.P2[1, 1] <= 0:
             raise DataError("calibration P2", "positive focal lengths", f"{self.P2[0, 0]:g}, {self.P2[1, 1]:g}")
+        rotations = {"P2": self.K, "R0_rect": self.R0_rect, "T_cam0_velo": self.T_cam0_velo}
+        for name, matrix in rotations.items():
+            if np.abs(matrix).max() > _MAX_ENTRY or np.linalg.cond(matrix) > _MAX_CONDITION:
+                expected = "a camera matrix" if name == "P2" else "a rotation"
+                raise DataError(f"calibration {name}", expected, "numbers that cannot be inverted")
 
     @cached_property
     def T_cam_velo(self) -> Array:
@@ -152,13 +162,7 @@ def parse_raw_calibration(cam_to_cam: str, velo_to_cam: str, where: str | Path =
 def read_calibration(path: str | Path) -> Calibration:
     """A calibration file on disk; see `parse_calibration`."""
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise DataError(path, "a calibration file", "no such file") from None
-    except UnicodeDecodeError:
-        raise DataError(path, "a text file with KITTI calibration lines", "bytes that are not UTF-8") from None
-    return parse_calibration(text, path)
+    return parse_calibration(read_text(path, "a calibration file"), path)
 
 
 def format_calibration(calibration: Calibration) -> str:

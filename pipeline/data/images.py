@@ -11,33 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.data.files import read_bytes
 from pipeline.errors import DataError
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_SIGNATURE = b"\xff\xd8"
 # Larger than any camera of the field; a header that claims more is damage, and is refused before memory is taken.
 MAX_PIXELS = 64_000_000
-MAX_FILE_BYTES = 512 * 1024 * 1024
 # JPEG markers that hold the frame size (SOF0-SOF15 without DHT, JPG, DAC); ITU-T T.81 table B.1.
 _SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-
-
-def read_bytes(path: Path, what: str) -> bytes:
-    """The bytes of a regular, readable, non-empty file. Raises DataError that names `what` was expected."""
-    try:
-        size = path.stat().st_size
-        if size > MAX_FILE_BYTES:
-            raise DataError(path, what, f"a file of {size / 1e9:.1f} GB")
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise DataError(path, what, "no such file") from None
-    except IsADirectoryError:
-        raise DataError(path, what, "a folder") from None
-    except PermissionError:
-        raise DataError(path, what, "a file that may not be read", "check its permissions") from None
-    if not data:
-        raise DataError(path, what, "an empty file", "was the disk full when it was written?")
-    return data
 
 
 def read_image(path: str | Path) -> NDArray[np.uint8]:

@@ -20,8 +20,9 @@ from detection.kitti_format import KittiObject, format_line, parse_lines
 from pipeline.data.calibration import Calibration, format_calibration, read_calibration
 from pipeline.data.dataset import Dataset
 from pipeline.data.depth_png import png_bytes, read_depth_png, write_depth_png
+from pipeline.data.files import read_bytes, read_text
 from pipeline.data.frame import Frame
-from pipeline.data.images import image_size, read_bytes, read_image, read_unchanged
+from pipeline.data.images import image_size, read_image, read_unchanged
 from pipeline.errors import DataError, UsageError
 from pipeline.runner.atomic import write_bytes, write_text
 
@@ -120,12 +121,7 @@ def read_labels(path: str | Path, scored: bool = False) -> list[KittiObject]:
     """The objects of a label file, or of a result file with `scored`. Raises DataError naming the line and column."""
     path = Path(path)
     what = "a KITTI result file" if scored else "a KITTI label file"
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise DataError(path, what, "no such file") from None
-    except UnicodeDecodeError:
-        raise DataError(path, what, "bytes that are not UTF-8 text") from None
+    text = read_text(path, what)
     try:
         return parse_lines(text, where=path.name, scored=scored)
     except ValueError as error:

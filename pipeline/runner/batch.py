@@ -130,7 +130,7 @@ class Batch:
             frame = self.dataset[frame_id]
             files = kind.files(self.config, self.run, frame_id)
             return task_key(shared, frame, kind.parts(self.config, frame), files, self.ledger.file_hash)
-        except (DataError, OSError) as error:
+        except (DataError, OSError, UsageError) as error:
             return f"cannot be opened: {error}"
 
     def is_up_to_date(self, stage: str, frame_id: str, key: str) -> bool:

@@ -7,7 +7,7 @@ import traceback
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from pipeline.errors import DataError
+from pipeline.errors import DataError, UsageError
 from pipeline.frame_files import Written
 
 # Errors after which going on with the next frame would only repeat them.
@@ -76,6 +76,8 @@ def outcome_of_error(task: Task, error: BaseException, seconds: float) -> Outcom
     if isinstance(error, DataError):
         failure = Failure(task.stage, task.frame, "data", error.where, error.expected, error.found, error.hint)
         return Outcome(task, {}, seconds, failure)
+    if isinstance(error, UsageError):
+        return Outcome(task, {}, seconds, _failure(task, "data", found=str(error)))
     text = "".join(traceback.format_exception(type(error), error, error.__traceback__))
     found = f"{type(error).__name__}: {' '.join(str(error).split())[:500]}"
     return Outcome(task, {}, seconds, _failure(task, "unexpected", found=found, detail=text))

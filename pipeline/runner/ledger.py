@@ -6,9 +6,11 @@ before it was written. Only the process that owns a shard writes its ledger; eve
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import sqlite3
+import stat
 import time
 from collections.abc import Iterable
 from contextlib import closing
@@ -17,7 +19,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from pipeline.errors import UsageError
-from pipeline.frame_files import Written, content_hash
+from pipeline.frame_files import Written, file_content_hash
 from pipeline.runner.jobs import Failure, Outcome
 
 _SCHEMA = """
@@ -29,6 +31,9 @@ CREATE TABLE IF NOT EXISTS failed (
 CREATE TABLE IF NOT EXISTS files (
   path TEXT PRIMARY KEY, size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL, hash TEXT NOT NULL);
 """
+
+# The largest weight files have a few gigabytes.
+_MAX_HASHED_BYTES = 64 * 10**9
 
 
 @dataclass(frozen=True)
@@ -106,8 +111,11 @@ class Ledger:
         """
         try:
             status = os.stat(path)
-        except OSError:
-            return "absent"
+        except OSError as error:
+            return "absent" if error.errno == errno.ENOENT else f"unreadable: {error.strerror}"
+        if not stat.S_ISREG(status.st_mode) or status.st_size > _MAX_HASHED_BYTES:
+            # A pipe would wait for ever, and no reader takes a file of this size: the key need not tell them apart.
+            return f"not read: {status.st_mode} {status.st_size} {status.st_mtime_ns}"
         known = self._connection.execute(
             "SELECT hash FROM files WHERE path = ? AND size = ? AND mtime_ns = ?",
             (str(path), status.st_size, status.st_mtime_ns),
@@ -115,7 +123,7 @@ class Ledger:
         if known is not None:
             return str(known[0])
         try:
-            value = content_hash(path.read_bytes())
+            value = file_content_hash(path)
         except OSError as error:
             return f"unreadable: {error.strerror}"
         if time.time() - status.st_mtime > 2:

@@ -6,11 +6,13 @@ import time
 from pathlib import Path
 
 from pipeline.config import Config
+from pipeline.data import Frame
+from pipeline.data.files import check_inside
 from pipeline.errors import DataError, UsageError
 from pipeline.frame_files import FrameFiles
 from pipeline.paths import RunFolder
 from pipeline.runner.jobs import Outcome, Task, outcome_of_error
-from pipeline.stages import FRAME_STAGES, FrameFunction, open_frames
+from pipeline.stages import FRAME_STAGES, FrameFunction, data_root, open_frames
 
 
 class FrameWorker:
@@ -30,10 +32,19 @@ class FrameWorker:
         start = time.perf_counter()
         files = FrameFiles(self.run_folder, task.frame)
         try:
-            process_frame(self.dataset[task.frame], files)
+            frame = self.dataset[task.frame]
+            self._check_links(task.stage, frame)
+            process_frame(frame, files)
         except Exception as error:
             return outcome_of_error(task, error, time.perf_counter() - start)
         return Outcome(task, files.written, time.perf_counter() - start)
+
+    def _check_links(self, stage: str, frame: Frame) -> None:
+        """Refuses files that are links out of the data set; a data set from elsewhere must not read other files."""
+        root = data_root(self.config, self.run_folder)
+        for part in FRAME_STAGES[stage].parts(self.config, frame):
+            for path in frame.files(part):
+                check_inside(path, root)
 
     def _function(self, stage: str) -> FrameFunction:
         if self._stage is None or self._stage[0] != stage:
