@@ -88,6 +88,10 @@ class ReportConfig(Section):
     """The HTML report."""
 
     frames: int = Field(default=20, ge=1, le=500, description="frames shown in detail")
+    compare: str | None = Field(default=None, description="folder of another run over the same frames")
+    format: Literal["html", "png", "pdf", "svg", "rrd", "mcap"] = Field(
+        default="html", description="further output beside the page: figures, or recordings for Rerun and Foxglove"
+    )
 
 
 class TrainConfig(LibrarySection):

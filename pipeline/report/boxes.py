@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from detection.boxes import corners
+from detection.evaluation.explain import Explanation
 from detection.kitti_format import KittiObject, boxes_of
 from pipeline.data.calibration import Calibration
+from pipeline.report.judged import is_wrong, verdict_text
 from pipeline.report.pictures import BirdsEye
 
 # Pairs of corners (order of detection.boxes.corners: bottom face, then top face) that make the twelve edges.
@@ -23,25 +25,43 @@ DRAWN = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram
 
 @dataclass(frozen=True)
 class DrawnBox:
-    """One object: SVG path data in image pixels and in bird's-eye pixels, and the text shown when pointed at."""
+    """One object: SVG path data in image pixels and in bird's-eye pixels, and the text shown when pointed at.
+
+    corners  (8, 3) metres, LiDAR frame, bottom face first
+    wrong    a missed label or a false positive
+    """
 
     kind: str
     image_path: str
     bev_path: str
     title: str
     score: float | None
+    corners: NDArray[np.float64]
+    wrong: bool = False
 
 
-def drawn_boxes(objects: Sequence[KittiObject], calibration: Calibration, size: tuple[int, int]) -> list[DrawnBox]:
-    """Paths of all objects that have a 3D box; `size` is (height, width) of the image in pixels."""
-    solid = [item for item in objects if item.type in DRAWN and min(item.size) > 0]
+def drawn_boxes(
+    objects: Sequence[KittiObject],
+    calibration: Calibration,
+    size: tuple[int, int],
+    verdicts: Mapping[int, Explanation] | None = None,
+) -> list[DrawnBox]:
+    """Paths of all objects that have a 3D box.
+
+    size      (height, width) of the image in pixels
+    verdicts  place in `objects` -> what became of the object, where that is known
+    """
+    places = [i for i, item in enumerate(objects) if item.type in DRAWN and min(item.size) > 0]
+    solid = [objects[i] for i in places]
     corner_sets = corners(boxes_of(solid))
-    return [
-        DrawnBox(
-            item.type, wireframe(points, calibration, size), footprint(points, calibration), _title(item), item.score
-        )
-        for item, points in zip(solid, corner_sets)
-    ]
+    found = []
+    for place, item, points in zip(places, solid, corner_sets):
+        verdict = (verdicts or {}).get(place)
+        paths = wireframe(points, calibration, size), footprint(points, calibration)
+        title = ", ".join(filter(None, (_title(item), verdict_text(verdict))))
+        velo = calibration.cam_to_velo(points)
+        found.append(DrawnBox(item.type, *paths, title, item.score, velo, is_wrong(verdict)))
+    return found
 
 
 def _title(item: KittiObject) -> str:

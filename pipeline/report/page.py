@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,54 +11,91 @@ from typing import Any
 import numpy as np
 
 from pipeline.config import Config
-from pipeline.data import Dataset, Frame
-from pipeline.errors import DataError
+from pipeline.data import Dataset
+from pipeline.errors import UsageError
 from pipeline.frame_files import FrameFiles
 from pipeline.paths import RunFolder
 from pipeline.report import pictures
-from pipeline.report.boxes import DrawnBox, drawn_boxes
-from pipeline.report.tables import ap_header, ap_rows, depth_rows
+from pipeline.report.cloud import palettes, point_budget
+from pipeline.report.hover import hover_step
+from pipeline.report.judged import (
+    CurvePanel,
+    Judged,
+    Mistake,
+    ap_cells,
+    curve_panels,
+    difference_rows,
+    judge,
+    mistakes,
+)
+from pipeline.report.tables import ap_header, ap_rows, depth_rows, number
+from pipeline.report.views import Display, FrameView, MistakeView, frame_view, mistake_view
 from pipeline.runner.atomic import write_text
 
-PHOTO_WIDTH, MAP_WIDTH = 1242, 760
 FOLDER = Path(__file__).resolve().parent
+# The worst mistakes listed at the top, and the share of the shown frames that is chosen for them.
+LISTED_MISTAKES = 24
+SCRIPTS = ("cloud.js", "script.js")
 
 
 @dataclass(frozen=True)
-class MapPicture:
-    """A map of a frame: caption, picture, and the legend it is read with ("depth", "sigma" or "error")."""
+class Page:
+    """What stands on the page beside the frames and the files of the run."""
 
-    caption: str
-    uri: str
-    legend: str
-
-
-@dataclass
-class FrameView:
-    """Everything shown of one frame; `problem` says why something is missing."""
-
-    id: str
-    height: int = 0
-    width: int = 0
-    photo: str = ""
-    maps: list[MapPicture] = field(default_factory=list)
-    birds_eye: str = ""
-    truth: list[DrawnBox] = field(default_factory=list)
-    found: list[DrawnBox] = field(default_factory=list)
-    steps: list[dict[str, Any]] = field(default_factory=list)
-    points: int = 0
-    problem: str = ""
+    views: list[FrameView]
+    total: int
+    worst: list[MistakeView] = field(default_factory=list)
+    n_mistakes: int = 0
+    ap: list[list[str]] = field(default_factory=list)
+    curves: list[CurvePanel] = field(default_factory=list)
+    other: RunFolder | None = None
+    differences: list[list[str]] = field(default_factory=list)
 
 
 def write_report(config: Config, run: RunFolder, dataset: Dataset, frames: tuple[str, ...]) -> Path:
-    """Writes the report of a run; returns its path.
+    """Writes the report of a run, and the figures or recordings that `report.format` asks for; returns its path.
 
-    At most `report.frames` frames are shown, spread evenly over the run.
+    At most `report.frames` frames are shown: those with the worst mistakes and others spread evenly over the run.
+    Raises UsageError when the run to compare with is not there.
     """
-    shown = spread(frames, config.report.frames)
-    views = [frame_view(config, dataset[frame_id], FrameFiles(run, frame_id)) for frame_id in shown]
-    write_text(run.report, render(run, views, len(frames)))
+    other = other_run(config)
+    judged = judge(config, run, dataset, frames)
+    judged_other = judge(config, other, dataset, frames) if other is not None else Judged()
+    found = mistakes(judged)
+    shown = chosen_frames(frames, found, config.report.frames)
+    display = Display(hover_step(len(shown)), point_budget(len(shown)), judged, other, judged_other)
+    page = Page(
+        views=[frame_view(dataset[frame_id], FrameFiles(run, frame_id), display) for frame_id in shown],
+        total=len(frames),
+        worst=worst_views(found, dataset, shown),
+        n_mistakes=len(found),
+        ap=ap_cells(judged),
+        curves=curve_panels(judged),
+        other=other,
+        differences=difference_rows(judged, judged_other),
+    )
+    write_text(run.report, render(run, page))
     return run.report
+
+
+def other_run(config: Config) -> RunFolder | None:
+    """The run that `report.compare` names."""
+    if config.report.compare is None:
+        return None
+    other = RunFolder(Path(config.report.compare))
+    if not other.config.is_file():
+        raise UsageError(f"report.compare: {other.root} is not a folder of a run (it has no config.yaml)")
+    return other
+
+
+def chosen_frames(frames: tuple[str, ...], found: Sequence[Mistake], count: int) -> tuple[str, ...]:
+    """At most `count` frames in order: half of them those of the worst mistakes, the others spread over the run."""
+    if len(frames) <= count:
+        return frames
+    worst = list(dict.fromkeys(mistake.frame for mistake in found))[: count // 2]
+    rest = tuple(frame for frame in frames if frame not in worst)
+    chosen = {*worst, *spread(rest, count - len(worst))}
+    return tuple(frame for frame in frames if frame in chosen)
 
 
 def spread(frames: tuple[str, ...], count: int) -> tuple[str, ...]:
@@ -67,7 +105,17 @@ def spread(frames: tuple[str, ...], count: int) -> tuple[str, ...]:
     return tuple(frames[index] for index in np.linspace(0, len(frames) - 1, count).round().astype(int))
 
 
-def render(run: RunFolder, views: list[FrameView], total: int) -> str:
+def worst_views(found: Sequence[Mistake], dataset: Dataset, shown: Sequence[str]) -> list[MistakeView]:
+    """The worst misses and the worst false positives, half each where there are enough of both."""
+    half = LISTED_MISTAKES // 2
+    missed = [mistake for mistake in found if mistake.kind == "missed"]
+    false = [mistake for mistake in found if mistake.kind == "false"]
+    listed = missed[: max(half, LISTED_MISTAKES - len(false))] + false[: max(half, LISTED_MISTAKES - len(missed))]
+    places = {frame_id: f"frame-{number}" for number, frame_id in enumerate(shown, start=1)}
+    return [mistake_view(mistake, dataset[mistake.frame], places.get(mistake.frame, "")) for mistake in listed]
+
+
+def render(run: RunFolder, page: Page) -> str:
     """The HTML text."""
     import jinja2
 
@@ -75,28 +123,38 @@ def render(run: RunFolder, views: list[FrameView], total: int) -> str:
         loader=jinja2.FileSystemLoader(FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters["thousands"] = lambda value: f"{value:,}"
-    metrics = _read_json(run.metrics)
-    failures = _read_json(run.failures)
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
+    metrics, failures = _read_json(run.metrics), _read_json(run.failures)
     return environment.get_template("page.html.j2").render(
         title=run.root.name,
         style=(FOLDER / "style.css").read_text(encoding="utf-8"),
-        script=(FOLDER / "script.js").read_text(encoding="utf-8"),
-        views=views,
-        total=total,
-        facts=headline(metrics, total),
+        script="\n".join((FOLDER / name).read_text(encoding="utf-8") for name in SCRIPTS),
+        page=page,
+        views=page.views,
+        total=page.total,
+        palettes=palettes(),
+        facts=headline(metrics, page.total),
         ap_header=ap_header(metrics),
-        ap_rows=ap_rows(metrics),
+        ap_rows=page.ap or ap_rows(metrics),
         warnings=metrics.get("warnings", []),
-        depth_rows=depth_rows(metrics),
+        depth_rows=depth_pairs(metrics, page.other),
         depth_frames=metrics.get("depth", {}).get("frames", 0),
         steps=metrics.get("augmentation", []),
         failures=failures.get("failures", []),
         config=run.config.read_text(encoding="utf-8") if run.config.is_file() else "",
-        legends=legends({map.legend for view in views for map in view.maps}),
+        legends=legends({map.legend for view in page.views for map in view.maps}),
         bev=pictures.BirdsEye(),
         bev_scale=pictures.BEV_PIXELS_PER_METRE,
         bev_rings=(20, 40, 60),
     )
+
+
+def depth_pairs(metrics: dict[str, Any], other: RunFolder | None) -> list[list[str]]:
+    """Depth measure, its mean, and the other run's mean when there is one."""
+    if other is None:
+        return depth_rows(metrics)
+    theirs = _read_json(other.metrics).get("depth", {}).get("mean", {})
+    return [[name, value, number(theirs[name]) if name in theirs else "-"] for name, value in depth_rows(metrics)]
 
 
 def headline(metrics: dict[str, Any], frames: int) -> list[tuple[str, str, str]]:
@@ -128,62 +186,6 @@ def legends(used: set[str]) -> dict[str, dict[str, Any]]:
         for name, (title, colours, ticks) in scales.items()
         if name in used
     }
-
-
-def frame_view(config: Config, frame: Frame, files: FrameFiles) -> FrameView:
-    """Pictures and boxes of a frame; what cannot be read is named in the view, the rest is shown."""
-    view = FrameView(frame.id)
-    for part in (_add_photo, _add_maps, _add_cloud, _add_boxes):
-        try:
-            part(frame, files, view)
-        except DataError as error:
-            view.problem = str(error)
-    return view
-
-
-def _add_photo(frame: Frame, files: FrameFiles, view: FrameView) -> None:
-    view.height, view.width = frame.image_size
-    view.photo = pictures.data_uri(frame.image, PHOTO_WIDTH, quality=72)
-
-
-def _add_maps(frame: Frame, files: FrameFiles, view: FrameView) -> None:
-    if not files.run.depth(frame.id).is_file():
-        return
-    completed = files.read_completed()
-
-    def add(caption: str, picture: pictures.RGB, legend: str = "depth", quality: int = 78) -> None:
-        view.maps.append(MapPicture(caption, pictures.data_uri(picture, MAP_WIDTH, quality), legend))
-
-    add("sparse depth, the input", pictures.colour_sparse(frame.sparse_depth))
-    add("completed depth", pictures.colour_depth(completed.depth))
-    if completed.foreground is not None and completed.background is not None and completed.sigma is not None:
-        add("foreground surface", pictures.colour_depth(completed.foreground))
-        add("background surface", pictures.colour_depth(completed.background))
-        add("sigma, weight of the foreground", pictures.colour_sigma(completed.sigma, completed.depth > 0), "sigma")
-    if frame.has("target_depth"):
-        add("true depth", pictures.colour_depth(frame.target_depth))
-        add("error of the completed depth", pictures.colour_error(completed.depth, frame.target_depth), "error")
-
-
-def _add_cloud(frame: Frame, files: FrameFiles, view: FrameView) -> None:
-    if files.run.cloud(frame.id).is_file():
-        cloud = files.read_cloud()
-        counts = files.read_counts()
-        view.steps, view.points = counts["steps"], counts["points"]
-        points, measured = cloud[:, :3], cloud[:, 4] == 0
-    elif not frame.has("points"):
-        return
-    else:
-        points = frame.points[:, :3]
-        measured = np.ones(len(points), dtype=bool)
-    view.birds_eye = pictures.data_uri(pictures.birds_eye_picture(points, measured), 10_000, quality=101)
-
-
-def _add_boxes(frame: Frame, files: FrameFiles, view: FrameView) -> None:
-    if files.run.detections(frame.id).is_file():
-        view.found = drawn_boxes(files.read_detections(), frame.calibration, frame.image_size)
-    if frame.has("labels"):
-        view.truth = drawn_boxes(frame.labels, frame.calibration, frame.image_size)
 
 
 def _read_json(path: Path) -> dict[str, Any]:

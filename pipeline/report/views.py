@@ -1,0 +1,231 @@
+"""What the page shows of one frame: photo, boxes, maps with their values, cloud, counts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data import Frame
+from pipeline.errors import DataError
+from pipeline.frame_files import FrameFiles
+from pipeline.paths import RunFolder
+from pipeline.report import pictures
+from pipeline.report.boxes import DrawnBox, drawn_boxes
+from pipeline.report.cloud import cloud_of_frame, still_picture
+from pipeline.report.hover import HoverGrid, hover_grid
+from pipeline.report.judged import Judged, Mistake, counts_of
+
+PHOTO_WIDTH, MAP_WIDTH = 1242, 620
+THUMB_WIDTH, THUMB_HEIGHT = 240, 140
+DEPTH_SCALE, SIGMA_SCALE = 256, 1000
+
+
+@dataclass(frozen=True)
+class MapPicture:
+    """A map of a frame: caption, picture, the legend it is read with ("depth", "sigma" or "error"), and its values."""
+
+    caption: str
+    uri: str
+    legend: str
+    grid: HoverGrid
+
+
+@dataclass(frozen=True)
+class Display:
+    """How the frames of one page are shown.
+
+    step    pixels between two values under the pointer
+    points  most points of one cloud
+    judged  what became of labels and detections
+    other   a second run to compare with, and its objects
+    """
+
+    step: int
+    points: int
+    judged: Judged = field(default_factory=Judged)
+    other: RunFolder | None = None
+    other_judged: Judged = field(default_factory=Judged)
+
+
+@dataclass
+class FrameView:
+    """Everything shown of one frame; `problem` says why something is missing."""
+
+    id: str
+    height: int = 0
+    width: int = 0
+    photo: str = ""
+    maps: list[MapPicture] = field(default_factory=list)
+    other_maps: list[MapPicture] = field(default_factory=list)
+    birds_eye: str = ""
+    truth: list[DrawnBox] = field(default_factory=list)
+    found: list[DrawnBox] = field(default_factory=list)
+    other: list[DrawnBox] = field(default_factory=list)
+    steps: list[dict[str, Any]] = field(default_factory=list)
+    other_steps: list[dict[str, Any]] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=dict)
+    points: int = 0
+    cloud: dict[str, Any] | None = None
+    still: str = ""
+    problem: str = ""
+
+
+def frame_view(frame: Frame, files: FrameFiles, display: Display) -> FrameView:
+    """Pictures and boxes of a frame; what cannot be read is named in the view, the rest is shown."""
+    view = FrameView(frame.id)
+    parts: tuple[Callable[[Frame, FrameFiles, Display, FrameView], None], ...] = (
+        _add_photo,
+        _add_maps,
+        _add_boxes,
+        _add_cloud,
+        _add_other,
+    )
+    for part in parts:
+        try:
+            part(frame, files, display, view)
+        except DataError as error:
+            view.problem = view.problem or str(error)
+    return view
+
+
+def _add_photo(frame: Frame, files: FrameFiles, display: Display, view: FrameView) -> None:
+    view.height, view.width = frame.image_size
+    view.photo = pictures.data_uri(frame.image, PHOTO_WIDTH, quality=68)
+
+
+def _add_maps(frame: Frame, files: FrameFiles, display: Display, view: FrameView) -> None:
+    if not files.run.depth(frame.id).is_file():
+        return
+    completed = files.read_completed()
+    depth_maps = [("sparse depth, the input", frame.sparse_depth), ("completed depth", completed.depth)]
+    if completed.foreground is not None and completed.background is not None:
+        depth_maps += [("foreground surface", completed.foreground), ("background surface", completed.background)]
+    if frame.has("target_depth"):
+        depth_maps.append(("true depth", frame.target_depth))
+    for caption, depth in depth_maps:
+        view.maps.append(depth_map(caption, depth, display.step))
+    if completed.sigma is not None:
+        view.maps.append(sigma_map(completed.sigma, completed.depth > 0, display.step))
+    if frame.has("target_depth"):
+        view.maps.append(error_map("error of the completed depth", completed.depth, frame.target_depth, display.step))
+
+
+def depth_map(caption: str, depth: NDArray[np.float32], step: int) -> MapPicture:
+    """A depth map on the shared scale; `sparse` ones are drawn with wide points."""
+    sparse = (depth > 0).mean() < 0.3
+    picture = pictures.colour_sparse(depth) if sparse else pictures.colour_depth(depth)
+    grid = hover_grid(depth, depth > 0, step, DEPTH_SCALE, "m")
+    return MapPicture(caption, pictures.data_uri(picture, MAP_WIDTH, 74), "depth", grid)
+
+
+def sigma_map(sigma: NDArray[np.float32], valid: NDArray[np.bool_], step: int) -> MapPicture:
+    """Weight of the foreground."""
+    uri = pictures.data_uri(pictures.colour_sigma(sigma, valid), MAP_WIDTH, 74)
+    return MapPicture("sigma, weight of the foreground", uri, "sigma", hover_grid(sigma, valid, step, SIGMA_SCALE, ""))
+
+
+def error_map(caption: str, depth: NDArray[np.float32], target: NDArray[np.float32], step: int) -> MapPicture:
+    """Absolute error where both depths have a value."""
+    uri = pictures.data_uri(pictures.colour_error(depth, target), MAP_WIDTH, 74)
+    grid = hover_grid(np.abs(depth - target), (depth > 0) & (target > 0), step, DEPTH_SCALE, "m")
+    return MapPicture(caption, uri, "error", grid)
+
+
+def _add_boxes(frame: Frame, files: FrameFiles, display: Display, view: FrameView) -> None:
+    def verdicts_of(side: str) -> dict[int, Any]:
+        found = display.judged.verdicts.items()
+        return {place: verdict for (of, where, place), verdict in found if of == frame.id and where == side}
+
+    if frame.has("labels"):
+        view.truth = drawn_boxes(frame.labels, frame.calibration, frame.image_size, verdicts_of("label"))
+    if files.run.detections(frame.id).is_file():
+        found = files.read_detections()
+        view.found = drawn_boxes(found, frame.calibration, frame.image_size, verdicts_of("detection"))
+        view.counts = counts_of(display.judged, frame.id) if frame.id in display.judged.labels else {}
+
+
+def _add_cloud(frame: Frame, files: FrameFiles, display: Display, view: FrameView) -> None:
+    if files.run.counts(frame.id).is_file():
+        view.steps = files.read_counts()["steps"]
+    cloud = cloud_of_frame(frame, files)
+    if cloud is None:
+        return
+    view.points = cloud.total
+    view.birds_eye = pictures.data_uri(pictures.birds_eye_picture(cloud.points, cloud.measured), 10_000, quality=101)
+    shown = cloud.thinned(display.points, seed=0)
+    view.cloud = shown.packed() | {"boxes": _boxes_3d(view)}
+    solid = [(kind, box.corners) for kind in ("truth", "found") for box in getattr(view, kind)]
+    view.still = pictures.data_uri(still_picture(cloud.thinned(8000, seed=0), solid), 10_000, quality=60)
+
+
+def _boxes_3d(view: FrameView) -> list[dict[str, Any]]:
+    return [
+        {"kind": kind, "corners": box.corners.round(2).tolist(), "score": box.score, "wrong": box.wrong}
+        for kind in ("truth", "found")
+        for box in getattr(view, kind)
+    ]
+
+
+def _add_other(frame: Frame, files: FrameFiles, display: Display, view: FrameView) -> None:
+    """The same frame in the run compared with."""
+    if display.other is None:
+        return
+    other = FrameFiles(display.other, frame.id)
+    if other.run.depth(frame.id).is_file():
+        depth = other.read_completed().depth
+        view.other_maps.append(depth_map("completed depth", depth, display.step))
+        if frame.has("target_depth") and frame.target_depth.shape == depth.shape:
+            view.other_maps.append(error_map("error of the completed depth", depth, frame.target_depth, display.step))
+    if other.run.counts(frame.id).is_file():
+        view.other_steps = other.read_counts()["steps"]
+    if other.run.detections(frame.id).is_file():
+        found = display.other_judged.verdicts.items()
+        wrong = {place: v for (of, side, place), v in found if of == frame.id and side == "detection"}
+        view.other = drawn_boxes(other.read_detections(), frame.calibration, frame.image_size, wrong)
+
+
+@dataclass(frozen=True)
+class MistakeView:
+    """A mistake in words, with a piece of the image and a link into the page (empty when its frame is not shown)."""
+
+    title: str
+    reason: str
+    kind: str
+    frame: str
+    link: str
+    thumb: str
+
+
+def mistake_view(mistake: Mistake, frame: Frame, link: str) -> MistakeView:
+    """Words and picture of a mistake."""
+    item = mistake.item
+    score = "" if item.score is None else f", score {item.score:.2f}"
+    title = f"{item.type}, {item.location[2]:.0f} m{score}"
+    return MistakeView(title, mistake.reason, mistake.kind, mistake.frame, link, thumbnail(frame, mistake))
+
+
+def thumbnail(frame: Frame, mistake: Mistake) -> str:
+    """The object in the image with some surroundings, its rectangle drawn; empty when the image cannot be read."""
+    import cv2
+
+    try:
+        image = frame.image
+    except DataError:
+        return ""
+    height, width = image.shape[:2]
+    left, top, right, bottom = mistake.item.bbox
+    wide = max(2.2 * (right - left), 2.2 * (bottom - top) * THUMB_WIDTH / THUMB_HEIGHT, 60.0)
+    wide = min(wide, width, height * THUMB_WIDTH / THUMB_HEIGHT)
+    high = wide * THUMB_HEIGHT / THUMB_WIDTH
+    x0 = float(np.clip((left + right - wide) / 2, 0, width - wide))
+    y0 = float(np.clip((top + bottom - high) / 2, 0, height - high))
+    crop = image[int(y0) : int(np.ceil(y0 + high)), int(x0) : int(np.ceil(x0 + wide))]
+    picture = np.ascontiguousarray(cv2.resize(crop, (THUMB_WIDTH, THUMB_HEIGHT), interpolation=cv2.INTER_CUBIC))
+    scale = THUMB_WIDTH / wide
+    first, second = ((round((x - x0) * scale), round((y - y0) * scale)) for x, y in ((left, top), (right, bottom)))
+    cv2.rectangle(picture, first, second, (43, 212, 164) if mistake.kind == "missed" else (255, 122, 26), 2)
+    return pictures.data_uri(picture, THUMB_WIDTH, 70)
