@@ -53,7 +53,8 @@ def lidar_rows(cloud: CameraCloud, height: NDArray[Any], features: Sequence[str]
     Features are those of `detection.inputs.point_features`, but the intensity stays raw, as OpenPCDet takes it.
     """
     columns = point_features(cloud, np.asarray(height, dtype=np.float32), features)
-    columns[:, [name == "intensity" for name in features]] += 0.5
+    if "intensity" in features:
+        columns[:, list(features).index("intensity")] = cloud.columns[:, 0]
     x, y, z = cloud.xyz.T
     return np.column_stack([z, -x, -y, columns]).astype(np.float32)
 

@@ -208,7 +208,9 @@ def ball_pool(
     for b, (radius, count) in enumerate(zip(radii, neighbours)):
         pooled = []
         for place in places:
-            near = [i for i, source in enumerate(sources) if float((source - place).square().sum()) < radius**2][:count]
+            near = [i for i, gap in enumerate((sources - place).square().sum(dim=1).tolist()) if gap < radius**2][
+                :count
+            ]
             rows = torch.cat([sources[near] - place, features[near]], dim=1)
             if not near:
                 rows = torch.zeros(1, 3 + features.shape[1])

@@ -1,0 +1,106 @@
+"""Training voxel detectors by the same loop as the point detectors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from detection.augment import PasteSettings
+from detection.checkpoints import load_tensors
+from detection.infer import Detector, load_detector
+from detection.kitti_format import KittiObject, boxes_of
+from detection.models.batch import PointBatch
+from detection.ops import iou_3d
+from detection.optimiser import OneCycleSettings
+from detection.train import Trainer, TrainSettings, train
+from detection.types import PointFrame
+from tests.detection.scenes import BoxFrames
+from tests.detection.voxel import tiny
+
+OPTIMISER = OneCycleSettings(peak=0.003, decay=0.01, clip=10.0)
+
+
+def settings(preset: str, **changes: object) -> TrainSettings:
+    base = TrainSettings(preset=preset, options={"classes": ["Car"]}, steps=2, batch_size=1, seed=3, save_every=1)
+    return replace(base, optimiser=OPTIMISER, **changes)  # type: ignore[arg-type]
+
+
+class ColouredFrames(BoxFrames):
+    """Box frames as augmented clouds: a fifth column says measured or completed."""
+
+    def __getitem__(self, index: int) -> tuple[PointFrame, list[KittiObject]]:
+        frame, labels = super().__getitem__(index)
+        source = (np.arange(len(frame.points)) % 2).astype(np.float32)
+        points = np.column_stack([frame.points, source])
+        return PointFrame(points, frame.T_cam_velo, frame.P2, frame.image_size, frame.id), labels
+
+
+def test_a_run_continues_to_the_bit_with_augmentation_and_pasting(tmp_path) -> None:
+    run = settings("pointpillars_small", paste=PasteSettings())
+    whole = train(run, BoxFrames(2, cars=2), tmp_path / "whole")
+    trainer = Trainer(run, BoxFrames(2, cars=2), "cpu")
+    trainer.step(0)
+    (tmp_path / "parts").mkdir()
+    trainer.save(tmp_path / "parts" / "state.safetensors", 1)
+    parts = train(run, BoxFrames(2, cars=2), tmp_path / "parts")
+    first, second = load_tensors(whole)[0], load_tensors(parts)[0]
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    detector = load_detector(whole)
+    assert detector.preset.name == "pointpillars_small"
+
+
+def test_extra_columns_reach_the_network() -> None:
+    run = settings("pointpillars_small", options={"features": ["intensity", "source"], "classes": ["Car"]})
+    batch = Trainer(run, ColouredFrames(1, cars=2), "cpu").batch(0)
+    assert batch.points.shape == (1, 0, 5)
+    assert set(batch.clouds[0][:, 4].tolist()) == {0.0, 1.0}
+    assert batch.clouds[0][:, 0].min() > 0  # x points forward
+    assert batch.boxes[0].shape == (2, 7)
+    assert batch.boxes[0][:, 3].min() > batch.boxes[0][:, 4].max()  # length before width
+
+
+@pytest.mark.parametrize("build", [tiny.tiny_second, tiny.tiny_voxel_rcnn, tiny.tiny_pv_rcnn])
+def test_every_parameter_is_trained_and_statistics_move(build) -> None:
+    model = build().train()
+    truth = torch.tensor([[1.5, 0.0, -1.0, 2.0, 1.5, 1.5, 0.3]])
+    # Boxes like a proposal, so that the second stage has foreground.
+    with torch.no_grad():
+        rois = model.first_stage([tiny.cloud()])[1].boxes[0, :1]
+    boxes = torch.cat([truth, rois])
+    batch = PointBatch(
+        torch.zeros(2, 0, 4),
+        [tiny.cloud(), tiny.cloud(seed=2)],
+        [boxes, truth[:0]],
+        [torch.ones(2, dtype=torch.long), torch.zeros(0, dtype=torch.long)],
+    )
+    before = {name: value.clone() for name, value in model.named_buffers() if name.endswith("running_mean")}
+    losses = model.training_losses(batch, np.random.default_rng(0))
+    parts = [value for name, value in losses.items() if name != "loss"]
+    torch.testing.assert_close(losses["loss"], torch.stack(parts).sum())
+    losses["loss"].backward()
+    without = [name for name, parameter in model.named_parameters() if parameter.grad is None]
+    assert without == []
+    finite = [bool(torch.isfinite(parameter.grad).all()) for parameter in model.parameters()]
+    assert all(finite)
+    moved = [not torch.equal(value, before[name]) for name, value in model.named_buffers() if name in before]
+    assert all(moved)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("preset", "steps", "overlap"), [("pointpillars_small", 100, 0.7), ("voxel_rcnn_small", 130, 0.6)]
+)
+def test_two_frames_are_learnt_by_heart(preset, steps, overlap) -> None:
+    frames = BoxFrames(2)
+    trainer = Trainer(settings(preset, steps=steps, scene=None), frames, "cpu")
+    for step in range(steps):
+        trainer.step(step)
+    detector = Detector(trainer.model.eval(), trainer.preset, torch.device("cpu"))
+    for frame, labels in frames.frames:
+        found = detector.detect(frame)
+        best = iou_3d(found.boxes.values, boxes_of(labels).values).max(axis=0)
+        assert best.min() > overlap
+        assert set(found.classes) == {"Car"}
