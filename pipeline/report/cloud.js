@@ -3,7 +3,7 @@
 const AugCloud = (() => {
   const EDGES = [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]];
   const VIEWS = {
-    behind: { yaw: 0, pitch: 0.42, distance: 34, target: [16, 0, -1.2] },
+    behind: { yaw: 0, pitch: 0.42, distance: 31, target: [14, 0, -1.2] },
     above: { yaw: 0, pitch: 1.5, distance: 62, target: [28, 0, 0] },
     side: { yaw: Math.PI / 2, pitch: 0.25, distance: 42, target: [18, 0, 0] },
     driver: { yaw: 0, pitch: 0.03, distance: 6, target: [6, 0, 0] },
@@ -124,7 +124,7 @@ const AugCloud = (() => {
       const { forward: f, right: r, up: u } = this.axes(), eye = this.target.map((value, k) => value - this.distance * f[k]);
       const place = (x, y, z) => {
         const a = x - eye[0], b = y - eye[1], c = z - eye[2], d = a * f[0] + b * f[1] + c * f[2];
-        const scale = (0.85 * width) / Math.max(d, 0.01);
+        const scale = (0.85 * Math.max(width, 1.5 * height)) / Math.max(d, 0.01);
         return [width / 2 + scale * (a * r[0] + b * r[1]), height / 2 - scale * (a * u[0] + b * u[1] + c * u[2]), d];
       };
       this.points(place, width, height, ratio);

@@ -150,7 +150,7 @@ def object_pixels(frame: Frame) -> NDArray[np.bool_]:
 
 STILL_WIDTH, STILL_HEIGHT = 760, 420
 # Where the page's camera stands at first: looking at this point (metres, LiDAR frame) from behind and above.
-TARGET, DISTANCE, PITCH, FOCAL = (16.0, 0.0, -1.2), 34.0, np.deg2rad(24.0), 0.85
+TARGET, DISTANCE, PITCH, FOCAL = (14.0, 0.0, -1.2), 31.0, np.deg2rad(24.0), 0.85
 
 
 def still_picture(cloud: FrameCloud, boxes: list[tuple[str, NDArray[np.float64]]]) -> pictures.RGB:
@@ -220,7 +220,7 @@ CLASS_COLOURS = {  # Cityscapes trainIds with their published colours
 
 
 def palettes() -> dict[str, Any]:
-    """Colouring -> title with either named byte values or a ramp; "distance" and "height" the script works out itself."""
+    """Colouring -> title and named byte values or a ramp; the script itself works out "distance" and "height"."""
     from pipeline.pointcloud.taxonomy import COLOURS, LABELS
 
     noise = {str(i): [name, list(colour)] for i, (name, colour) in enumerate(zip(LABELS, COLOURS))}

@@ -1,4 +1,4 @@
-"""The detections of a run, judged: AP with confidence intervals, PR curves, and the worst mistakes with their reasons."""
+"""The detections of a run, judged: AP with confidence intervals, PR curves, worst mistakes with their reasons."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Judged:
 class Mistake:
     """A label that no detection found, or a detection of nothing.
 
-    weight  how bad: metres that a missed object is nearer than 100 m, or the rank of a false positive's score in percent
+    weight  how bad: metres that a missed object is nearer than 100 m, or percent of all scores that a false one reaches
     """
 
     frame: str
