@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from completion.backends import BACKENDS, Convolutions, other_than_torch
 from completion.checkpoints import load_checkpoint
 from completion.inputs import scale_rgb
 from completion.models import ModelSpec
 from completion.models.classical import ClassicalCompleter
-from completion.readout import read_output
+from completion.models.selection import Selection
+from completion.models.selection_cpu import complete_mixture
+from completion.readout import Maps, read_output, require_read_out
 from completion.types import CompletedDepth, DepthFrame, FloatMap
-
-BACKENDS = ("torch",)
 
 
 class Completer(Protocol):
@@ -39,8 +40,9 @@ class Completer(Protocol):
 class NetworkCompleter:
     """A network with its input scaling, on one device. Any image size: padded at the top and right, cut back after.
 
-    read_out  see `completion.readout`
-    rows      predict the bottom `rows` rows only (published protocols: 352, 256), 0 elsewhere; None: full height
+    read_out      see `completion.readout`
+    rows          predict the bottom `rows` rows only (published protocols: 352, 256), 0 elsewhere; None: full height
+    convolutions  computes the network's convolutions in its place (see `completion.backends`); None: torch does
     """
 
     def __init__(
@@ -50,10 +52,12 @@ class NetworkCompleter:
         device: str | torch.device = "cpu",
         read_out: str = "fused",
         rows: int | None = None,
+        convolutions: Convolutions | None = None,
     ) -> None:
+        require_read_out(spec, read_out)
         self.device = torch.device(device)
         self.model = model.to(device=self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
-        self.spec, self.read_out, self.rows = spec, read_out, rows
+        self.spec, self.read_out, self.rows, self.convolutions = spec, read_out, rows, convolutions
 
     def complete(
         self, sparse: FloatMap, image: NDArray[np.uint8], K: NDArray[np.float64] | None = None
@@ -82,26 +86,45 @@ class NetworkCompleter:
             return [CompletedDepth(one) for one in depth]
         return [CompletedDepth(*maps) for maps in zip(depth, foreground, background, sigma)]
 
-    def _run(self, sparse: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor | None, Tensor | None, Tensor | None]:
+    def _run(self, sparse: Tensor, rgb: Tensor) -> Maps:
         """(B, 1, h, w), (B, 3, h, w) uint8 -> depth, foreground, background, sigma, each (B, h, w) or None."""
+        if isinstance(self.model, Selection) and self.device.type == "cpu":
+            return self._run_selection(self.model, sparse, rgb)
         height, width = sparse.shape[-2:]
         multiple = self.spec.multiple_of
         padding = (0, -width % multiple, -height % multiple, 0)
         colours = F.pad(scale_rgb(rgb, self.spec.rgb), padding, mode="replicate")
         scaled = F.pad(sparse, padding) / self.spec.depth_unit
-        outputs = self.model(scaled, colours.contiguous(memory_format=torch.channels_last))
-        full = outputs[0] if isinstance(outputs, tuple) else outputs
+        full = self._forward(scaled, colours.contiguous(memory_format=torch.channels_last))
         return read_output(full[:, :, padding[2] :, :width], self.spec, self.read_out)
+
+    def _forward(self, sparse: Tensor, rgb: Tensor) -> Tensor:
+        """Inputs as the network takes them -> its finest output."""
+        if self.convolutions is not None:
+            return self.convolutions(sparse, rgb)
+        outputs = self.model(sparse, rgb)
+        finest: Tensor = outputs[0] if isinstance(outputs, tuple) else outputs
+        return finest
+
+    def _run_selection(self, model: Selection, sparse: Tensor, rgb: Tensor) -> Maps:
+        frames = [
+            complete_mixture(model, self.convolutions, one[0].numpy(), image.numpy(), self.spec.rgb, self.read_out)
+            for one, image in zip(sparse, rgb.permute(0, 2, 3, 1))
+        ]
+        depth, foreground, background, sigma = (torch.from_numpy(np.stack(maps)) for maps in zip(*frames))
+        return depth, foreground, background, sigma
 
 
 def load_completer(path_or_name: str | Path, device: str = "cpu", backend: str = "torch") -> Completer:
-    """The completer of a weights file, of an embedded name, or "classical" (no weights).
+    """The completer of a weights file, of an embedded name, or "classical" (no weights, no backend).
 
-    ValueError for an unknown backend, `checkpoints.CheckpointError` for weights that cannot be used.
+    ValueError for an unknown backend or one that cannot run this network there, ImportError without its packages,
+    `checkpoints.CheckpointError` for weights that cannot be used.
     """
     if backend not in BACKENDS:
         raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, got {backend!r}")
     if str(path_or_name) == "classical":
         return ClassicalCompleter()
     model, card = load_checkpoint(path_or_name)
-    return NetworkCompleter(model, card.model, device, card.read_out)
+    convolutions = other_than_torch(model, card, device, backend)
+    return NetworkCompleter(model, card.model, device, card.read_out, convolutions=convolutions)

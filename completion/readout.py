@@ -26,6 +26,15 @@ def default_read_out(spec: ModelSpec) -> str:
     return {"mixture": "median", "twin": "fused", "coefficients": "all", "depth": "depth"}[spec.output]
 
 
+def require_read_out(spec: ModelSpec, read_out: str) -> None:
+    """ValueError when a network's output cannot be read this way."""
+    allowed = READ_OUTS_OF[spec.output]
+    if read_out not in allowed:
+        raise ValueError(
+            f"read_out: a network with output {spec.output!r} offers {', '.join(allowed)}, got {read_out!r}"
+        )
+
+
 def read_output(output: Tensor, spec: ModelSpec, read_out: str) -> Maps:
     """(B, C, h, w) full-resolution output -> depth, foreground, background, sigma, each (B, h, w) in metres, or None.
 
@@ -33,11 +42,7 @@ def read_output(output: Tensor, spec: ModelSpec, read_out: str) -> Maps:
               one channel: "depth"; mixture: one of MIXTURE_READ_OUTS.
     Raises ValueError when it does not fit the network's output.
     """
-    allowed = READ_OUTS_OF[spec.output]
-    if read_out not in allowed:
-        raise ValueError(
-            f"read_out: a network with output {spec.output!r} offers {', '.join(allowed)}, got {read_out!r}"
-        )
+    require_read_out(spec, read_out)
     if spec.output == "mixture":
         return _read_mixture(output.float(), read_out)
     if spec.output == "twin":

@@ -21,6 +21,8 @@ from completion.models.rings import Rings, find_rings
 
 COLUMN_SHIFTS = (0, -6, 6)
 CANDIDATES = 3 * len(COLUMN_SHIFTS) + 1
+# Channels of the input: colours and `depth_features`.
+INPUTS = 10
 # Channels of the output: weights (logits), natural log of depth in metres, and one log scale.
 CHANNELS = 2 * CANDIDATES + 1
 
@@ -93,7 +95,7 @@ class Selection(nn.Module):
     def __init__(self, width: int = 24, residual: float = 0.1) -> None:
         super().__init__()
         self.residual = residual
-        self.network = PixelUNet(10, CHANNELS, width)
+        self.network = PixelUNet(INPUTS, CHANNELS, width)
 
     def forward(self, sparse: Tensor, rgb: Tensor) -> tuple[Tensor]:
         require_multiple(sparse, rgb, 32)

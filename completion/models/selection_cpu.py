@@ -7,6 +7,7 @@ is written out here. Rows are shared among as many threads as torch uses.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -20,11 +21,10 @@ from torch import Tensor
 from completion.inputs import scale_rgb
 from completion.mixture import surface_shares
 from completion.models.rings import enclose
-from completion.models.selection import CANDIDATES, CHANNELS, COLUMN_SHIFTS, Selection
+from completion.models.selection import CANDIDATES, CHANNELS, COLUMN_SHIFTS, INPUTS, Selection
 from completion.twin_surface import fuse
 
 Float = NDArray[np.float32]
-INPUTS = 10
 GAMMA = 2.0
 _RUN = 128  # pixels
 _MEASURED = CANDIDATES - 1
@@ -58,33 +58,47 @@ def _write_inputs(first, last, image, colours, sparse, rings, logs, out):  # typ
     the first three rings, out (H/2, W/2, 40)
     """
     height, width = sparse.shape
+    run = np.empty((INPUTS, _RUN), np.float32)
     for y in range(2 * first, 2 * last):
-        row = np.float32(2 * y / (height - 1) - 1)
-        for x in range(width):
-            corner = 2 * (y % 2) + x % 2
-            pixel = out[y // 2, x // 2]
-            for c in range(3):
-                pixel[4 * c + corner] = colours[c, image[y, x, c]]
-            between = logs[2, y, x]
-            pixel[12 + corner] = between - np.float32(2.7)
+        run[9] = np.float32(2 * y / (height - 1) - 1)
+        for start in range(0, width, _RUN):
+            count = min(_RUN, width - start)
+            for i in range(count):
+                x = start + i
+                for c in range(3):
+                    run[c, i] = colours[c, image[y, x, c]]
+                run[3, i] = logs[2, y, x] - np.float32(2.7)
+                run[8, i] = _ONE if sparse[y, x] > 0 else _ZERO
             for side in range(2):
-                difference = np.float32(3) * (logs[side, y, x] - between)
-                pixel[16 + 4 * side + corner] = min(max(difference, np.float32(-3)), np.float32(3))
-                pixel[24 + 4 * side + corner] = rings[3 + side, y, x] * np.float32(0.0625) - _ONE
-            pixel[32 + corner] = _ONE if sparse[y, x] > 0 else _ZERO
-            pixel[36 + corner] = row
+                for i in range(count):
+                    x = start + i
+                    difference = np.float32(3) * (logs[side, y, x] - logs[2, y, x])
+                    run[4 + side, i] = min(max(difference, np.float32(-3)), np.float32(3))
+                    run[6 + side, i] = rings[3 + side, y, x] * np.float32(0.0625) - _ONE
+            for c in range(INPUTS):
+                for side in range(2):
+                    channel = 4 * c + 2 * (y % 2) + side
+                    for i in range(count // 2):
+                        out[y // 2, start // 2 + i, channel] = run[c, 2 * i + side]
 
 
 @njit(inline="always")
 def _gather(head, y, start, count, weights, depths):  # type: ignore[no-untyped-def]
     """Logits and corrections of `count` pixels of row y from column `start` (even): undoes the pixel shuffle."""
     corner = 2 * (y % 2)
-    for i in range(0, count, 2):
-        pixel = head[y // 2, (start + i) // 2]
-        for k in range(CANDIDATES):
-            for side in range(2):
-                weights[k, i + side] = pixel[4 * k + corner + side]
-                depths[k, i + side] = pixel[4 * (CANDIDATES + k) + corner + side]
+    row = head[y // 2, start // 2 : (start + count) // 2]
+    if head.strides[2] == head.itemsize:  # torch: the channels of a pixel lie together
+        for i in range(len(row)):
+            for k in range(CANDIDATES):
+                for side in range(2):
+                    weights[k, 2 * i + side] = row[i, 4 * k + corner + side]
+                    depths[k, 2 * i + side] = row[i, 4 * (CANDIDATES + k) + corner + side]
+        return
+    for k in range(CANDIDATES):  # ONNX Runtime: the pixels of a channel do
+        for side in range(2):
+            for i in range(len(row)):
+                weights[k, 2 * i + side] = row[i, 4 * k + corner + side]
+                depths[k, 2 * i + side] = row[i, 4 * (CANDIDATES + k) + corner + side]
 
 
 @njit(inline="always")
@@ -197,13 +211,13 @@ def _in_threads(kernel: Callable[..., None], rows: int, *arguments: object) -> N
         return
     edges = [rows * part // threads for part in range(threads + 1)]
     with ThreadPoolExecutor(threads) as pool:
-        for done in [pool.submit(kernel, a, b, *arguments) for a, b in zip(edges, edges[1:])]:
+        for done in [pool.submit(kernel, a, b, *arguments) for a, b in itertools.pairwise(edges)]:
             done.result()
 
 
 def complete_mixture(
     model: Selection,
-    convolutions: Callable[[Tensor], Tensor],
+    convolutions: Callable[[Tensor], Tensor] | None,
     sparse: Float,
     image: NDArray[np.uint8],
     scaling: str,
@@ -211,7 +225,7 @@ def complete_mixture(
 ) -> tuple[Float, Float, Float, Float]:
     """Sparse (h, w) metres and image (h, w, 3) of any size -> depth, foreground, background, sigma, each (h, w).
 
-    convolutions  (1, 40, H/2, W/2) -> (1, 84, H/2, W/2): `model.network.at_half` or an export of it
+    convolutions  (1, 40, H/2, W/2) -> (1, 84, H/2, W/2), an export of `model.network.at_half`; None: that itself
     scaling       of the colours, see `inputs.scale_rgb`
     read_out      one of `readout.MIXTURE_READ_OUTS`
     """
@@ -223,16 +237,21 @@ def complete_mixture(
     logs = np.log(rings[:3])
     levels = torch.arange(256, dtype=torch.float32).expand(1, 3, 1, 256)
     colours = scale_rgb(levels, scaling)[0, :, 0].contiguous().numpy()
-    features = np.empty((padded.shape[0] // 2, padded.shape[1] // 2, 4 * INPUTS), np.float32)
-    _in_threads(_write_inputs, len(features), pixels, colours, padded, rings, logs, features)
-    head = convolutions(torch.from_numpy(features).permute(2, 0, 1)[None])
+    half = (padded.shape[0] // 2, padded.shape[1] // 2)
+    if convolutions is None:  # torch is fastest with the channels of a pixel together, exports take planes
+        features = np.empty((*half, 4 * INPUTS), np.float32)
+    else:
+        features = np.empty((4 * INPUTS, *half), np.float32).transpose(1, 2, 0)
+    _in_threads(_write_inputs, half[0], pixels, colours, padded, rings, logs, features)
+    run = convolutions or model.network.at_half
+    head = run(torch.from_numpy(features).permute(2, 0, 1)[None])
     assert head.shape[1] == 4 * CHANNELS, head.shape
     low, high = surface_shares(GAMMA)
     out = np.empty((4, height, width), np.float32)
     _in_threads(
         _read_rows,
         height,
-        head[0].float().permute(1, 2, 0).contiguous().numpy(),
+        head[0].float().permute(1, 2, 0).numpy(),
         logs,
         top,
         np.array(COLUMN_SHIFTS),

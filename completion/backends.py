@@ -1,0 +1,136 @@
+"""Who computes the convolutions on the CPU: torch, or an export of the network in ONNX Runtime or OpenVINO.
+
+Exports are kept in the user's cache folder ($XDG_CACHE_HOME/auglidar, ~/.cache/auglidar) under the SHA-256 of their
+weights; any image size fits one file. Deleting them is always safe.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import warnings
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from completion.checkpoints import Card, write_atomically
+from completion.models.selection import INPUTS, Selection
+
+BACKENDS = ("torch", "onnxruntime", "openvino", "auto")
+# Pure convolutions; the others encode depth or are too large to be worth it.
+EXPORTABLE = ("selection", "twise", "msg_chn")
+OPSET = 17
+# Part of the file names: raise it when the exported part of a network changes.
+EXPORT_VERSION = 1
+
+Convolutions = Callable[..., Tensor]
+
+
+class _Part(nn.Module):
+    """What is exported: a selection network between its pixel shuffles, or the finest output of any other network."""
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        if isinstance(self.model, Selection):
+            return self.model.network.at_half(*inputs)
+        output: Tensor = self.model(*inputs)[0]
+        return output
+
+
+def other_than_torch(model: nn.Module, card: Card, device: str, backend: str) -> Convolutions | None:
+    """The convolutions of a network for `infer.NetworkCompleter`, or None when torch is to compute them.
+
+    backend  one of BACKENDS; "auto" is ONNX Runtime where it is installed and can run this network, else torch
+
+    ValueError for a network or device that `backend` cannot run, ImportError when its packages are missing.
+    """
+    fits = card.model.architecture in EXPORTABLE and torch.device(device).type == "cpu"
+    if backend == "auto":
+        backend = "onnxruntime" if fits and find_spec("onnx") and find_spec("onnxruntime") else "torch"
+    if backend == "torch":
+        return None
+    if not fits:
+        raise ValueError(
+            f"backend {backend!r} runs {', '.join(EXPORTABLE)} on the CPU, not {card.model.architecture} on {device}; "
+            "use backend 'torch'"
+        )
+    for package in ("onnx", "onnxruntime") if backend == "onnxruntime" else ("onnx", "openvino"):
+        if find_spec(package) is None:
+            extra = "onnx" if backend == "onnxruntime" else "onnx,openvino"
+            raise ImportError(f"backend {backend!r} needs {package}: pip install 'auglidar[{extra}]'")
+    graph = exported(model, card)
+    return _onnxruntime(graph) if backend == "onnxruntime" else _openvino(graph)
+
+
+def cache_folder() -> Path:
+    """Where exports are kept."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "auglidar"
+
+
+def exported(model: nn.Module, card: Card) -> bytes:
+    """The ONNX graph of a network's convolutions, from the cache when these weights were exported before."""
+    path = cache_folder() / f"{card.model.architecture}-{card.sha256[:32]}-{EXPORT_VERSION}.onnx"
+    if card.sha256 and path.is_file():
+        return path.read_bytes()
+    graph = export_onnx(model)
+    if card.sha256:
+        try:
+            write_atomically(path, graph)
+        except OSError as error:
+            warnings.warn(f"{path}: the exported network is not kept: {error}", RuntimeWarning, stacklevel=2)
+    return graph
+
+
+def export_onnx(model: nn.Module) -> bytes:
+    """ONNX graph for any batch and image size; inputs and output as in `NetworkCompleter`."""
+    channels = (4 * INPUTS,) if isinstance(model, Selection) else (1, 3)
+    inputs = tuple(torch.rand(1, count, 64, 96) for count in channels)
+    names = [f"input{number}" for number in range(len(inputs))]
+    file = io.BytesIO()
+    with warnings.catch_warnings():
+        # The exporter that needs no further package is called legacy; shape checks of the networks are not traced.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            _Part(model).eval(),
+            inputs,
+            file,
+            input_names=names,
+            output_names=["output"],
+            opset_version=OPSET,
+            dynamic_axes={name: {0: "batch", 2: "height", 3: "width"} for name in (*names, "output")},
+            dynamo=False,
+        )
+    return file.getvalue()
+
+
+def _onnxruntime(graph: bytes) -> Convolutions:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
+    names = [given.name for given in session.get_inputs()]
+
+    def run(*inputs: Tensor) -> Tensor:
+        return torch.from_numpy(session.run(None, {name: x.contiguous().numpy() for name, x in zip(names, inputs)})[0])
+
+    return run
+
+
+def _openvino(graph: bytes) -> Convolutions:
+    import openvino
+
+    core = openvino.Core()
+    options = {"INFERENCE_NUM_THREADS": torch.get_num_threads(), "INFERENCE_PRECISION_HINT": "f32"}
+    compiled = core.compile_model(core.read_model(graph), "CPU", options)
+
+    def run(*inputs: Tensor) -> Tensor:
+        return torch.from_numpy(compiled([x.contiguous().numpy() for x in inputs])[0].copy())
+
+    return run

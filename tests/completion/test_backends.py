@@ -1,0 +1,102 @@
+"""Exports: equal to torch at sizes they were not traced at, kept under their weights' hash, refused with a reason."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from completion import backends
+from completion.checkpoints import Card, save_checkpoint
+from completion.infer import NetworkCompleter, load_completer
+from completion.models import build_model, default_spec
+from completion.readout import default_read_out
+from tests.completion.scenes import street
+
+SMALL = {"selection": {"width": 8}, "twise": {"channels": 8}, "msg_chn": {"channels": 4}}
+NEEDS = {"onnxruntime": ("onnx", "onnxruntime"), "openvino": ("onnx", "openvino")}
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "auglidar"
+
+
+def saved(folder: Path, architecture: str, seed: int = 0) -> Path:
+    torch.manual_seed(seed)
+    spec = default_spec(architecture, **SMALL[architecture])
+    model = build_model(spec)
+    if architecture == "selection":
+        torch.nn.init.normal_(model.network.head.weight, std=0.3)
+    return save_checkpoint(folder / f"{architecture}{seed}", model, Card(spec, default_read_out(spec)))
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
+@pytest.mark.parametrize("architecture", sorted(SMALL))
+def test_equal_to_torch_within_a_millimetre(tmp_path: Path, architecture: str, backend: str) -> None:
+    for package in NEEDS[backend]:
+        pytest.importorskip(package)
+    path = saved(tmp_path, architecture)
+    there, here = load_completer(path, backend=backend), load_completer(path)
+    for size in ((75, 130), (64, 64)):
+        frame = street(1, *size)
+        found, expected = (one.complete(frame.sparse, frame.image) for one in (there, here))
+        assert np.abs(found.depth - expected.depth).max() < 1e-3
+        assert found.has_surfaces == expected.has_surfaces
+
+
+def test_exports_are_kept_by_their_weights(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("onnxruntime")
+    first, second = saved(tmp_path, "twise", 0), saved(tmp_path, "twise", 1)
+    load_completer(first, backend="onnxruntime")
+    load_completer(second, backend="onnxruntime")
+    assert len(list(cache.glob("twise-*.onnx"))) == 2
+
+    def export_again(_model: torch.nn.Module) -> bytes:
+        raise AssertionError("exported twice")
+
+    monkeypatch.setattr(backends, "export_onnx", export_again)
+    load_completer(first, backend="onnxruntime")
+
+
+def test_a_cache_that_cannot_be_written_is_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("onnxruntime")
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    with pytest.warns(RuntimeWarning, match="not kept"):
+        load_completer(saved(tmp_path, "twise"), backend="onnxruntime")
+
+
+def test_auto_takes_what_there_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("onnxruntime")
+    path = saved(tmp_path, "twise")
+    found = load_completer(path, backend="auto")
+    assert isinstance(found, NetworkCompleter)
+    assert found.convolutions is not None
+    monkeypatch.setattr(backends, "find_spec", lambda name: None)
+    without = load_completer(path, backend="auto")
+    assert isinstance(without, NetworkCompleter)
+    assert without.convolutions is None
+
+
+def test_auto_leaves_other_networks_to_torch(tmp_path: Path) -> None:
+    spec = default_spec("depth_coefficients", count=8, size=10.0)
+    path = save_checkpoint(tmp_path / "dc", build_model(spec), Card(spec, "all"))
+    found = load_completer(path, backend="auto")
+    assert isinstance(found, NetworkCompleter)
+    assert found.convolutions is None
+    with pytest.raises(ValueError, match="depth_coefficients on cpu; use backend 'torch'"):
+        load_completer(path, backend="onnxruntime")
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
+def test_missing_packages_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, backend: str) -> None:
+    path = saved(tmp_path, "twise")
+    real = importlib.util.find_spec
+    monkeypatch.setattr(backends, "find_spec", lambda name: None if name == backend else real(name) or object())
+    with pytest.raises(ImportError, match=rf"needs {backend}: pip install 'auglidar\["):
+        load_completer(path, backend=backend)
