@@ -6,8 +6,8 @@ weights; any image size fits one file. Deleting them is always safe.
 
 from __future__ import annotations
 
-import io
 import os
+import tempfile
 import warnings
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -92,21 +92,21 @@ def export_onnx(model: nn.Module) -> bytes:
     channels = (4 * INPUTS,) if isinstance(model, Selection) else (1, 3)
     inputs = tuple(torch.rand(1, count, 64, 96) for count in channels)
     names = [f"input{number}" for number in range(len(inputs))]
-    file = io.BytesIO()
-    with warnings.catch_warnings():
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         # The exporter that needs no further package is called legacy; shape checks of the networks are not traced.
         warnings.simplefilter("ignore")
+        path = Path(folder) / "network.onnx"
         torch.onnx.export(
             _Part(model).eval(),
             inputs,
-            file,
+            path,
             input_names=names,
             output_names=["output"],
             opset_version=OPSET,
             dynamic_axes={name: {0: "batch", 2: "height", 3: "width"} for name in (*names, "output")},
             dynamo=False,
         )
-    return file.getvalue()
+        return path.read_bytes()
 
 
 def _onnxruntime(graph: bytes) -> Convolutions:
