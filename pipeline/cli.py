@@ -131,6 +131,11 @@ def main_parser(verbs: dict[str, str]) -> argparse.ArgumentParser:
     add(
         "--shard", metavar="i/n", type=_shard, help="every n-th frame from the i-th, counted from 0 (Slurm, Kubernetes)"
     )
+    add(
+        "--format",
+        choices=("html", "png", "pdf", "svg", "rrd", "mcap"),
+        help="with --stage report: figures for papers, or recordings for Rerun and Foxglove, beside the page",
+    )
     add("--dry-run", action="store_true", help="print frames, files, GB and minutes; write nothing")
     return parser
 
@@ -162,6 +167,8 @@ def _run_stages(args: argparse.Namespace, arguments: Sequence[str]) -> int:
     for key, value in (("data.root", args.data), ("data.frames", args.frames), ("augment.depth_from", args.depth_from)):
         if value is not None:
             overrides.append(f"{key}={json.dumps(value)}")
+    if args.format is not None:
+        overrides.append(f"report.format={args.format}")
     if args.workers is not None:
         overrides.append(f"run.workers={args.workers}")
     return carry_out(

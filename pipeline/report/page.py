@@ -75,6 +75,10 @@ def write_report(config: Config, run: RunFolder, dataset: Dataset, frames: tuple
         differences=difference_rows(judged, judged_other),
     )
     write_text(run.report, render(run, page))
+    if config.report.format in ("png", "pdf", "svg"):
+        from pipeline.report.figures import write_figures
+
+        write_figures(config, run, dataset, frames, judged)
     return run.report
 
 
