@@ -86,8 +86,10 @@ def check_request(request: Request, stage: str) -> None:
     """What can be refused before any work: a wrong stage or combination of options."""
     if stage not in STAGES:
         raise UsageError(f"unknown stage {stage!r}; {nearest_name(stage, STAGES)}")
-    if request.engine != "local":
-        raise UsageError(f"engine {request.engine!r} is not available in this version; use --engine local")
+    if request.engine == "ray":
+        from pipeline.runner.ray_engine import check_available
+
+        check_available()
     if request.shard is not None and stage not in FRAME_STAGES:
         raise UsageError(
             f"--shard is for complete, augment and detect; run --stage {stage} once for all shards, without it"
@@ -154,7 +156,7 @@ def dry_run(config: Config, run: RunFolder, stage: str, shard: tuple[int, int] |
 
 def run_batch(request: Request, config: Config, run: RunFolder, stage: str, stop: StopRequest) -> int:
     """The frame stages, then the scores and the report when they are asked for."""
-    batch = open_batch(config, run, request.shard, stop)
+    batch = open_batch(config, run, request.shard, stop, request.engine)
     try:
         stages = stages_to_run(stage, config, batch.dataset)
         summaries = [batch.run_stage(name) for name in stages if not stop()]

@@ -16,7 +16,7 @@ from pipeline.runner.budget import DiskBudget
 from pipeline.runner.jobs import Outcome, Task
 from pipeline.runner.keys import stage_key, task_key
 from pipeline.runner.ledger import Ledger, Row
-from pipeline.runner.processes import LocalEngine, available_cores
+from pipeline.runner.processes import LocalEngine, WorkerFactory, available_cores
 from pipeline.runner.progress import Counter, progress
 from pipeline.runner.signals import StopRequest
 from pipeline.runner.worker import FrameWorker
@@ -152,18 +152,30 @@ def _has_size(path: Path, size: int) -> bool:
         return False
 
 
+def make_engine(name: str, worker: WorkerFactory, workers: int, frames: int) -> Engine:
+    """The engine of this name with no more than one worker per frame; workers = 0 is one per core."""
+    if name == "ray":
+        from pipeline.runner.ray_engine import RayEngine
+
+        return RayEngine(worker, min(workers, frames))
+    return LocalEngine(worker, min(workers or available_cores(), max(frames, 1)))
+
+
 def shard_of(frames: Sequence[str], shard: tuple[int, int] | None) -> tuple[str, ...]:
     """Every n-th frame from the i-th: shard (i, n) of the frames; all of them without a shard."""
     return tuple(frames) if shard is None else tuple(frames[shard[0] :: shard[1]])
 
 
-def open_batch(config: Config, run: RunFolder, shard: tuple[int, int] | None, stop: StopRequest) -> Batch:
-    """A batch over the frames of the configuration with local processes. Raises UsageError when it cannot be set up."""
+def open_batch(
+    config: Config, run: RunFolder, shard: tuple[int, int] | None, stop: StopRequest, engine: str = "local"
+) -> Batch:
+    """A batch over the frames of the configuration; engine: local or ray. UsageError when it cannot be set up."""
     dataset = open_frames(config, run)
     frames = shard_of(dataset.ids, shard)
     own = run.ledger(shard)
     ledger = Ledger(own, run.ledgers())
-    workers = min(config.run.workers or available_cores(), max(len(frames), 1))
-    engine = LocalEngine(partial(FrameWorker, config, run.root), workers)
+    worker = partial(FrameWorker, config, run.root)
     budget = DiskBudget(run.root, config.run.keep_free_gb, config.run.max_gb)
-    return Batch(config, run, ledger, frames, dataset, stop, engine, budget)
+    return Batch(
+        config, run, ledger, frames, dataset, stop, make_engine(engine, worker, config.run.workers, len(frames)), budget
+    )

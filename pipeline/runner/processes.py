@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
@@ -20,6 +21,8 @@ from typing import Protocol
 from pipeline.errors import UsageError
 from pipeline.runner.jobs import Outcome, Task, crashed
 
+# One in hand and one to go on with.
+TASKS_PER_WORKER = 2
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
@@ -82,38 +85,39 @@ class LocalEngine:
     def outcomes(self, tasks: Iterator[Task], stopping: Callable[[], bool]) -> Iterator[Outcome]:
         """Outcomes in the order they come. No new task is begun once `stopping()`; those in hand are finished.
 
-        Each worker holds one task, and the next is taken from `tasks` when one is done: memory does not grow with
-        the number of tasks.
+        Each worker holds two tasks, one to work on and one to go on with while this process writes the ledger and
+        looks at the files of the next (which brings them into the memory of the system). The next is taken from
+        `tasks` when one is done: memory does not grow with the number of tasks.
         """
         if self._count == 1:
             yield from self._outcomes_here(tasks, stopping)
             return
         while len(self._processes) < self._count:
             self._processes.append(_WorkerProcess(self._make_worker))
-        busy = self._feed(tasks, self._processes, stopping)
-        while busy:
+        self._feed(tasks, self._processes * TASKS_PER_WORKER, stopping)
+        while busy := [process for process in self._processes if process.tasks]:
             for ready in wait([process.pipe for process in busy]):
                 process = next(process for process in busy if process.pipe is ready)
                 yield process.receive()
                 if process.ended:
-                    self._processes.remove(process)
-                    process = _WorkerProcess(self._make_worker)
-                    self._processes.append(process)
+                    process = self._replaced(process)
                 self._feed(tasks, [process], stopping)
-            busy = [process for process in self._processes if process.task is not None]
 
-    def _feed(
-        self, tasks: Iterator[Task], idle: list[_WorkerProcess], stopping: Callable[[], bool]
-    ) -> list[_WorkerProcess]:
-        """Gives each idle process a task; returns those that got one."""
-        fed: list[_WorkerProcess] = []
-        for process in idle:
+    def _replaced(self, ended: _WorkerProcess) -> _WorkerProcess:
+        """A new process in the place of one that ended; it gets the task that one had not begun."""
+        process = _WorkerProcess(self._make_worker)
+        self._processes[self._processes.index(ended)] = process
+        for task in ended.tasks:
+            process.send(task)
+        return process
+
+    def _feed(self, tasks: Iterator[Task], free: list[_WorkerProcess], stopping: Callable[[], bool]) -> None:
+        """Gives a task to each process of `free`, as long as there are tasks."""
+        for process in free:
             task = None if stopping() else next(tasks, None)
             if task is None:
-                break
+                return
             process.send(task)
-            fed.append(process)
-        return fed
 
     def _outcomes_here(self, tasks: Iterator[Task], stopping: Callable[[], bool]) -> Iterator[Outcome]:
         if self._inline is None:
@@ -131,7 +135,7 @@ class LocalEngine:
 
 
 class _WorkerProcess:
-    """A process, the pipe to it, and the task it has in hand."""
+    """A process, the pipe to it, and the tasks it was given, the one in hand first."""
 
     def __init__(self, make_worker: WorkerFactory) -> None:
         context = multiprocessing.get_context("spawn")
@@ -140,11 +144,11 @@ class _WorkerProcess:
         with _one_thread_for_children():
             self.process.start()
         inner.close()
-        self.task: Task | None = None
+        self.tasks: deque[Task] = deque()
         self.ended = False
 
     def send(self, task: Task) -> None:
-        self.task = task
+        self.tasks.append(task)
         try:
             self.pipe.send(task)
         except OSError:
@@ -153,9 +157,7 @@ class _WorkerProcess:
 
     def receive(self) -> Outcome:
         """The outcome of the task in hand; a crash when the process ended."""
-        task, self.task = self.task, None
-        if task is None:
-            raise RuntimeError("a worker answered without having a task")
+        task = self.tasks.popleft()
         try:
             answer = self.pipe.recv()
         except (EOFError, OSError):

@@ -59,7 +59,6 @@ def test_help_answers_at_once_and_imports_nothing_heavy() -> None:
         (["--config", "kitti", "--data", "/no/such/folder"], "no such folder: /no/such/folder"),
         (["--config", "nothing.yaml"], "no such configuration file: nothing.yaml"),
         (["--set", "seeed=3"], "unknown key seeed; did you mean 'seed'?"),
-        (["--engine", "ray"], "engine 'ray' is not available"),
         (["--stage", "report", "--shard", "0/2"], "run --stage report once for all shards"),
         (["--stage", "synth", "--config", "kitti", "--data", "."], "--stage synth makes synthetic data"),
     ],
