@@ -75,11 +75,28 @@ def write_report(config: Config, run: RunFolder, dataset: Dataset, frames: tuple
         differences=difference_rows(judged, judged_other),
     )
     write_text(run.report, render(run, page))
-    if config.report.format in ("png", "pdf", "svg"):
+    write_beside(config, run, dataset, frames, judged)
+    return run.report
+
+
+def write_beside(
+    config: Config, run: RunFolder, dataset: Dataset, frames: tuple[str, ...], judged: Judged
+) -> list[Path]:
+    """What `report.format` asks for beside the page: figures, or a recording of all frames for a viewer."""
+    kind = config.report.format
+    if kind in ("png", "pdf", "svg"):
         from pipeline.report.figures import write_figures
 
-        write_figures(config, run, dataset, frames, judged)
-    return run.report
+        return write_figures(config, run, dataset, frames, judged)
+    if kind == "html":
+        return []
+    from pipeline.viewers.mcap_file import write_mcap
+    from pipeline.viewers.rerun_file import write_rrd
+    from pipeline.viewers.scene import scenes
+
+    write = write_rrd if kind == "rrd" else write_mcap
+    path = run.report.parent / f"{run.root.name}.{kind}"
+    return [write(path, scenes(run, dataset, frames), run.root.name)]
 
 
 def other_run(config: Config) -> RunFolder | None:

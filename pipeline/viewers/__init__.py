@@ -1,0 +1,1 @@
+"""Recordings of a run for viewers: Rerun (.rrd) and Foxglove (.mcap)."""
