@@ -90,13 +90,17 @@ class NetworkCompleter:
         """(B, 1, h, w), (B, 3, h, w) uint8 -> depth, foreground, background, sigma, each (B, h, w) or None."""
         if isinstance(self.model, Selection) and self.device.type == "cpu":
             return self._run_selection(self.model, sparse, rgb)
+        return read_output(self._network_output(sparse, rgb), self.spec, self.read_out)
+
+    def _network_output(self, sparse: Tensor, rgb: Tensor) -> Tensor:
+        """(B, 1, h, w) metres, (B, 3, h, w) uint8 -> the finest output (B, C, h, w), of any size."""
         height, width = sparse.shape[-2:]
         multiple = self.spec.multiple_of
         padding = (0, -width % multiple, -height % multiple, 0)
         colours = F.pad(scale_rgb(rgb, self.spec.rgb), padding, mode="replicate")
         scaled = F.pad(sparse, padding) / self.spec.depth_unit
         full = self._forward(scaled, colours.contiguous(memory_format=torch.channels_last))
-        return read_output(full[:, :, padding[2] :, :width], self.spec, self.read_out)
+        return full[:, :, padding[2] :, :width]
 
     def _forward(self, sparse: Tensor, rgb: Tensor) -> Tensor:
         """Inputs as the network takes them -> its finest output."""
