@@ -28,5 +28,9 @@ check: setup  ## ruff, mypy, architecture
 bench: setup  ## time our code beside its peers, write benchmarks/RESULTS.md
 	@$(BIN)/python -m benchmarks
 
+docs: setup  ## the documentation as site/index.html, readable without a network
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[docs]"
+	@$(BIN)/python scripts/build_docs.py
+
 clean:  ## remove the environment and everything generated
-	rm -rf $(VENV) build *.egg-info runs .mypy_cache .ruff_cache
+	rm -rf $(VENV) build site *.egg-info runs .mypy_cache .ruff_cache

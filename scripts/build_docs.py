@@ -1,0 +1,195 @@
+"""Builds the documentation as a static site that opens without a server or a network: python scripts/build_docs.py
+
+docs/*.md, the notebooks, CONTRIBUTING.md, CHANGELOG.md and an API reference made from the docstrings go to build/docs;
+Zensical (extra `docs`) turns them into site/. `--sources-only` stops before Zensical.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import json
+import re
+import shutil
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+SOURCES = ROOT / "build" / "docs"
+# The modules a user imports; each page of the reference holds those of one room.
+API: dict[str, tuple[str, ...]] = {
+    "completion": (
+        "completion.types", "completion.infer", "completion.checkpoints", "completion.metrics", "completion.losses",
+        "completion.twin_surface", "completion.depth_coefficients", "completion.analysis", "completion.train",
+    ),
+    "detection": (
+        "detection.types", "detection.boxes", "detection.kitti_format", "detection.infer", "detection.checkpoints",
+        "detection.ops", "detection.evaluation.kitti_ap", "detection.train",
+    ),
+    "pipeline": (
+        "pipeline.data", "pipeline.data.frame", "pipeline.data.calibration", "pipeline.data.projection",
+        "pipeline.data.depth_png", "pipeline.pointcloud.augment", "pipeline.pointcloud.presets",
+        "pipeline.pointcloud.sigma_filter", "pipeline.pointcloud.grid_sampling", "pipeline.pointcloud.radius_gather",
+        "pipeline.pointcloud.pseudo_sigma", "pipeline.simulation.synth", "pipeline.simulation.noise", "pipeline.config",
+    ),
+}  # fmt: skip
+# Long lines of docstrings wrap; pictures drawn for paper stand on white in the dark colours too.
+STYLE = """\
+.language-text code { white-space: pre-wrap; }
+.md-typeset img { background: white; border-radius: 4px; }
+.md-typeset table code { word-break: normal; overflow-wrap: anywhere; }
+@media (max-width: 40em) {
+  .md-typeset table:not([class]) th, .md-typeset table:not([class]) td { padding: 0.4em 0.5em; min-width: 0; }
+}
+"""
+OUTSIDE = {"../CONTRIBUTING.md": "contributing.md", "../CHANGELOG.md": "changelog.md"}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sources-only", action="store_true", help="write build/docs and stop")
+    args = parser.parse_args()
+    write_sources(SOURCES)
+    if args.sources_only:
+        return 0
+    try:
+        import zensical  # noqa: F401
+    except ImportError:
+        print("build_docs: Zensical is missing; install it with: pip install -e '.[docs]'", file=sys.stderr)
+        return 2
+    zensical_program = Path(sys.executable).with_name("zensical")
+    done = subprocess.run([zensical_program, "build", "--clean", "--strict"], cwd=ROOT, check=False)
+    if done.returncode == 0:
+        print(f"open {ROOT / 'site' / 'index.html'}")
+    return done.returncode
+
+
+def write_sources(out: Path) -> None:
+    """Everything Zensical reads, freshly into `out`."""
+    shutil.rmtree(out, ignore_errors=True)
+    shutil.copytree(ROOT / "docs", out, ignore=shutil.ignore_patterns("*.py"))
+    (out / "site.css").write_text(STYLE, encoding="utf-8")
+    for name in ("CONTRIBUTING", "CHANGELOG"):
+        text = (ROOT / f"{name}.md").read_text(encoding="utf-8")
+        (out / f"{name.lower()}.md").write_text(text.replace("(docs/", "("), encoding="utf-8")
+    (out / "notebooks").mkdir()
+    for notebook in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        (out / "notebooks" / f"{notebook.stem}.md").write_text(notebook_page(notebook), encoding="utf-8")
+    (out / "api").mkdir()
+    for room, modules in API.items():
+        (out / "api" / f"{room}.md").write_text(api_page(room, modules), encoding="utf-8")
+    for page in out.glob("*.md"):
+        page.write_text(inside_links(page.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+def inside_links(text: str) -> str:
+    """Links to files beside docs/ as links inside the site; other files of the repository lose their link."""
+    for outside, inside in OUTSIDE.items():
+        text = text.replace(f"({outside})", f"({inside})")
+    text = re.sub(r"\(\.\./notebooks/([\w-]+)\.ipynb\)", r"(notebooks/\1.md)", text)
+    return re.sub(r"\[([^\]]*)\]\(\.\./[^)]*\)", r"\1", text)
+
+
+def notebook_page(notebook: Path) -> str:
+    """A stored notebook with its outputs as Markdown; pictures are embedded."""
+    parts = []
+    for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"]:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            parts.append(source)
+            continue
+        parts.append(f"```python\n{source}\n```")
+        parts += [shown for output in cell["outputs"] if (shown := output_text(output))]
+    return "\n\n".join(parts) + "\n"
+
+
+def output_text(output: dict[str, Any]) -> str:
+    """One output of a cell as Markdown."""
+    data = output.get("data", {})
+    if "image/png" in data:
+        picture = "".join(data["image/png"]).replace("\n", "")
+        return f'<img alt="output of the cell above" src="data:image/png;base64,{picture}">'
+    text = "".join(output.get("text", data.get("text/plain", ""))).rstrip()
+    return f"```text\n{text}\n```" if text else ""
+
+
+def api_page(room: str, modules: tuple[str, ...]) -> str:
+    """The reference of one room: signature and docstring of every public class and function."""
+    parts = [f"# API: {room}", "Made from the docstrings. Depth and coordinates are metres unless said otherwise."]
+    for name in modules:
+        module = import_module(name)
+        parts += [f"## `{name}`", as_text(inspect.getdoc(module) or "")]
+        for title, item in public_names(module):
+            parts += entry(title, item)
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def public_names(module: ModuleType) -> list[tuple[str, Any]]:
+    """Public classes and functions that the module defines, or names in `__all__`."""
+    exported = getattr(module, "__all__", None)
+    names = list(exported) if exported is not None else [name for name in vars(module) if not name.startswith("_")]
+    found = []
+    for name in names:
+        item = getattr(module, name)
+        own = exported is not None or getattr(item, "__module__", None) == module.__name__
+        if own and (inspect.isclass(item) or callable(item)):
+            found.append((name, item))
+    return found
+
+
+def entry(title: str, item: Any) -> list[str]:
+    """Heading, signature and docstring; of a class also its public methods."""
+    parts = [f"### `{title}`", f"```python\n{signature(title, item)}\n```", as_text(own_doc(item))]
+    if not inspect.isclass(item):
+        return parts
+    for name, member in vars(item).items():
+        target = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
+        if name.startswith("_") or not inspect.isfunction(target):
+            continue
+        text = own_doc(target)
+        if text:
+            shown = name if isinstance(member, property) else signature(name, target)
+            parts.append(f"```python\n{title}.{shown}\n```\n\n{as_text(text)}")
+    return parts
+
+
+def own_doc(item: Any) -> str:
+    """The docstring; nothing for the one that a dataclass makes of its fields."""
+    text = inspect.getdoc(item) or ""
+    return "" if text.startswith(f"{getattr(item, '__name__', '')}(") else text
+
+
+def signature(name: str, item: Any) -> str:
+    """`name(parameters) -> result`, one parameter a line when long."""
+    try:
+        found = inspect.signature(item)
+    except (TypeError, ValueError):
+        return name
+    result = found.return_annotation
+    ends = "" if inspect.isclass(item) or result is inspect.Signature.empty else f" -> {result}"
+    text = f"{name}({', '.join(map(str, found.parameters.values()))}){ends}"
+    if len(text) > 90:
+        lines = "".join(f"    {parameter},\n" for parameter in found.parameters.values())
+        text = f"{name}(\n{lines}){ends}"
+    return re.sub(r"(: |-> )'([^']*)'", r"\1\2", text)  # annotations are stored as text
+
+
+def as_text(docstring: str) -> str:
+    """A docstring as Markdown: prose as paragraphs, and columns of names and meanings as they stand in the source."""
+    return "\n\n".join(map(paragraph, docstring.split("\n\n"))) if docstring else ""
+
+
+def paragraph(text: str) -> str:
+    """One paragraph of a docstring. Two spaces inside a line, or an indented first line, mean columns or code."""
+    if re.search(r"\S {2,}\S", text) or text.startswith(" ") or " = " in text.splitlines()[0]:
+        return f"```text\n{text}\n```"
+    pieces = re.split(r"(`[^`]*`)", " ".join(text.split()))
+    return "".join(p if p.startswith("`") else re.sub(r"([*_<\[\]])", r"\\\1", p) for p in pieces)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
