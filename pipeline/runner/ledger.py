@@ -12,8 +12,8 @@ import os
 import sqlite3
 import stat
 import time
-from collections.abc import Iterable
-from contextlib import closing
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
@@ -74,16 +74,18 @@ class Ledger:
     def row(self, stage: str, frame: str) -> Row | None:
         """The last time this task was finished, by any shard."""
         query = "SELECT key, written, seconds, finished_at FROM done WHERE stage = ? AND frame = ?"
-        found = [row for reader in self._readers for row in reader.execute(query, (stage, frame))]
-        if not found:
-            return None
-        key, written, seconds, finished_at = max(found, key=lambda row: row[3])
-        return Row(key, {name: Written(*file) for name, file in json.loads(written).items()}, seconds, finished_at)
+        with _explained(self.path):
+            found = [row for reader in self._readers for row in reader.execute(query, (stage, frame))]
+            if not found:
+                return None
+            key, written, seconds, finished_at = max(found, key=lambda row: row[3])
+            files = {str(name): Written(int(size), str(value)) for name, (size, value) in json.loads(written).items()}
+            return Row(key, files, float(seconds), float(finished_at))
 
     def record(self, outcome: Outcome, key: str) -> None:
         """Writes what became of a task; durable when the call returns."""
         stage, frame = outcome.task.stage, outcome.task.frame
-        with self._connection:
+        with _explained(self.path), self._connection:
             if outcome.failure is not None:
                 text = json.dumps(outcome.failure.as_dict())
                 self._connection.execute("REPLACE INTO failed VALUES (?, ?, ?)", (stage, frame, text))
@@ -95,13 +97,14 @@ class Ledger:
 
     def forget_failures(self, stage: str, frames: Iterable[str]) -> None:
         """Removes noted failures of tasks that are about to be tried again or are no longer asked for."""
-        with self._connection:
+        with _explained(self.path), self._connection:
             rows = [(stage, frame) for frame in frames]
             self._connection.executemany("DELETE FROM failed WHERE stage = ? AND frame = ?", rows)
 
     def failures(self) -> list[Failure]:
         """All failures noted in this ledger."""
-        return _failures(self._connection)
+        with _explained(self.path):
+            return _failures(self._connection)
 
     def file_hash(self, path: Path) -> str:
         """Hash of a file's contents; remembered with its size and time, so that unchanged files are read once.
@@ -116,10 +119,11 @@ class Ledger:
         if not stat.S_ISREG(status.st_mode) or status.st_size > _MAX_HASHED_BYTES:
             # A pipe would wait for ever, and no reader takes a file of this size: the key need not tell them apart.
             return f"not read: {status.st_mode} {status.st_size} {status.st_mtime_ns}"
-        known = self._connection.execute(
-            "SELECT hash FROM files WHERE path = ? AND size = ? AND mtime_ns = ?",
-            (str(path), status.st_size, status.st_mtime_ns),
-        ).fetchone()
+        with _explained(self.path):
+            known = self._connection.execute(
+                "SELECT hash FROM files WHERE path = ? AND size = ? AND mtime_ns = ?",
+                (str(path), status.st_size, status.st_mtime_ns),
+            ).fetchone()
         if known is not None:
             return str(known[0])
         try:
@@ -127,7 +131,7 @@ class Ledger:
         except OSError as error:
             return f"unreadable: {error.strerror}"
         if time.time() - status.st_mtime > 2:
-            with self._connection:
+            with _explained(self.path), self._connection:
                 row = (str(path), status.st_size, status.st_mtime_ns, value)
                 self._connection.execute("REPLACE INTO files VALUES (?, ?, ?, ?)", row)
         return value
@@ -135,7 +139,8 @@ class Ledger:
     def mean_seconds(self, stage: str) -> float | None:
         """Mean measured seconds per frame of a stage over all shards, or None."""
         query = "SELECT COUNT(*), TOTAL(seconds) FROM done WHERE stage = ?"
-        found = [row for reader in self._readers for row in reader.execute(query, (stage,))]
+        with _explained(self.path):
+            found = [row for reader in self._readers for row in reader.execute(query, (stage,))]
         count = sum(row[0] for row in found)
         return sum(row[1] for row in found) / count if count else None
 
@@ -144,27 +149,39 @@ def all_failures(ledgers: Iterable[Path]) -> list[Failure]:
     """The failures of all shards of a run, sorted."""
     found: list[Failure] = []
     for path in ledgers:
-        with closing(_opened(path, f"file:{quote(str(path.resolve()))}?mode=rw")) as connection:
+        with closing(_opened(path, f"file:{quote(str(path.resolve()))}?mode=rw")) as connection, _explained(path):
             found += _failures(connection)
     return sorted(found, key=lambda failure: (failure.stage, failure.frame))
 
 
 def _opened(path: Path, uri: str) -> sqlite3.Connection:
     """A connection to a ledger with its tables. Raises UsageError when it cannot be used."""
-    try:
+    with _explained(path):
         connection = sqlite3.connect(uri, uri=True, timeout=60)
-        connection.execute("PRAGMA synchronous = FULL")
-        connection.executescript(_SCHEMA)
-    except sqlite3.DatabaseError as error:
-        raise UsageError(f"{path}: {error}; {_hint(error)}") from None
+        try:
+            connection.execute("PRAGMA synchronous = FULL")
+            connection.executescript(_SCHEMA)
+        except BaseException:
+            connection.close()
+            raise
     return connection
+
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Trouble with a ledger as a UsageError that says what to do."""
+    try:
+        yield
+    except (sqlite3.DatabaseError, ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        # The latter kinds: rows that another program wrote, or that damage changed.
+        raise UsageError(f"{path}: {error}; {_hint(error)}") from None
 
 
 def _failures(connection: sqlite3.Connection) -> list[Failure]:
     return [Failure(**json.loads(text)) for (text,) in connection.execute("SELECT failure FROM failed")]
 
 
-def _hint(error: sqlite3.DatabaseError) -> str:
+def _hint(error: Exception) -> str:
     if isinstance(error, sqlite3.OperationalError):
         return "is the folder writable and the disk not full?"
     return "the ledger is damaged: remove it; finished frames will be computed again"

@@ -1,0 +1,29 @@
+"""Short runs of every fuzzing target, and the inputs that were found once. Long runs: `python -m tests.fuzz`."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.fuzz.targets import TARGETS, try_file
+
+EXAMPLES = 60
+# Long enough for a busy machine; a reader that hangs or takes gigabytes is over it.
+DEADLINE_MS = 5000
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_a_damaged_file_is_taken_or_refused_and_nothing_else(name: str) -> None:
+    @settings(
+        max_examples=EXAMPLES,
+        deadline=DEADLINE_MS,
+        database=None,
+        derandomize=True,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(st.data())
+    def tried(data: st.DataObject) -> None:
+        try_file(name, data.draw(TARGETS[name].files()))
+
+    tried()
