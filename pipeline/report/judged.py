@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -101,7 +102,7 @@ def mistakes(judged: Judged) -> list[Mistake]:
             found.append(Mistake(frame, "missed", item, reason, 100.0 - item.location[2]))
         else:
             item = judged.detections[frame][place]
-            rank = sum(score <= (item.score or 0.0) for score in scores) / len(scores)
+            rank = bisect_right(scores, item.score or 0.0) / len(scores)
             found.append(Mistake(frame, "false", item, reason, 100.0 * rank))
     return sorted(found, key=lambda mistake: (-mistake.weight, mistake.frame))
 
@@ -160,7 +161,7 @@ def _interval_text(item: Interval) -> str:
 def difference_rows(first: Judged, second: Judged) -> list[list[str]]:
     """AP of this run, of the other, and the paired difference with its interval, per class, metric and level.
 
-    Only the frames that both have are compared; empty when there is none.
+    Only the frames that both have are compared, empty when there is none; rows without any AP are left out.
     """
     shared = [frame for frame in first.labels if frame in second.detections]
     if first.evaluation is None or not shared:
@@ -181,7 +182,7 @@ def difference_rows(first: Judged, second: Judged) -> list[list[str]]:
             f"{row.difference:+.1f} [{row.low:+.1f}, {row.high:+.1f}]",
         ]
         for row in paired_differences(evaluations, RESAMPLING)
-        if row.target.metric in ("3d", "bev")
+        if row.target.metric in ("3d", "bev") and (row.ap > 0 or row.ap != row.difference)
     ]
 
 

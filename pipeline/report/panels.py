@@ -142,7 +142,7 @@ def oblique(axis: Axes, points: NDArray[np.float32], colours: NDArray[np.float64
     place, depth = _seen_from(kept, *camera)
     order = np.argsort(-depth, kind="stable")
     size = 0.15 if len(kept) > 60_000 else 0.3 if len(kept) > 15_000 else 0.6
-    axis.scatter(*place[order].T, s=size, c=colours[inside][order], linewidths=0, rasterized=True)
+    axis.scatter(place[order, 0], place[order, 1], s=size, c=colours[inside][order], linewidths=0, rasterized=True)
     # The same limits for every cloud of a window, so that panels can be compared.
     edge, _ = _seen_from(np.array([(x, y, z) for x in (x0, x1) for y in (y0, y1) for z in (-2, 2)]), *camera)
     axis.set(xlim=(edge[:, 0].min(), edge[:, 0].max()), ylim=(edge[:, 1].min(), edge[:, 1].max()))

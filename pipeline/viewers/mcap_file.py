@@ -1,6 +1,6 @@
 """A run as an MCAP file for Foxglove (extra `viewer`), with Foxglove's own message kinds written as JSON.
 
-Fields and numbers of the messages: Foxglove's schema reference (foxglove.PointCloud, SceneUpdate, CompressedImage); the container: the MCAP specification (mcap.dev).
+Fields and numbers of the messages: Foxglove's schema reference; the container: the MCAP specification (mcap.dev).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""JSON schemas of the Foxglove messages we write: the viewer finds base64 fields by them (Foxglove schema reference)."""
+"""JSON schemas of the Foxglove messages we write, after its schema reference: they tell the viewer what is base64."""
 
 from __future__ import annotations
 

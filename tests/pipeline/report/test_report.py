@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -16,14 +14,14 @@ import pytest
 from detection.kitti_format import KittiObject
 from pipeline.config import load_config
 from pipeline.data import open_dataset
-from pipeline.frame_files import FrameFiles
 from pipeline.paths import RunFolder
 from pipeline.report import pictures
 from pipeline.report.boxes import footprint, wireframe
-from pipeline.report.page import spread, write_report
+from pipeline.report.page import spread
 from pipeline.report.tables import markdown_table, number
 from pipeline.scoring import evaluate_run, mean_of, mean_steps
-from tests.pipeline.tiny_kitti import CALIBRATION, write_tiny_kitti
+from tests.pipeline.report.scored import score_and_report
+from tests.pipeline.tiny_kitti import CALIBRATION
 
 VOID = {"meta", "input", "img", "br"}
 
@@ -55,33 +53,6 @@ class Page(HTMLParser):
         assert self.open_tags.pop() == tag
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    """A scored run over three tiny frames whose detections are the labels themselves, found with score 1."""
-    from completion.types import CompletedDepth
-    from pipeline.pointcloud.augment import AugmentedCloud
-
-    data = write_tiny_kitti(tmp_path / "kitti", 3)
-    run = RunFolder(tmp_path / "run")
-    for frame in open_dataset("kitti_object", data):
-        files = FrameFiles(run, frame.id)
-        true_depth = frame.target_depth
-        files.write_completed(CompletedDepth(true_depth + 1, true_depth, true_depth + 2, np.full_like(true_depth, 0.5)))
-        cloud = np.column_stack([frame.points, np.zeros(len(frame.points))]).astype(np.float32)
-        names = ("x", "y", "z", "intensity", "source")
-        files.write_cloud(AugmentedCloud(cloud, names, (("grid_sampling", 100, 40), ("join", 40, 40))))
-        files.write_detections([replace(item, score=1.0) for item in frame.labels])
-    (run.root / "config.yaml").write_text(f"data: {{name: kitti_object, root: {data}}}\n")
-    return run
-
-
-def score_and_report(run: RunFolder) -> str:
-    config = load_config(run.config)
-    dataset = open_dataset("kitti_object", str(config.data.root))
-    evaluate_run(config, run, dataset, dataset.ids)
-    return write_report(config, run, dataset, dataset.ids).read_text(encoding="utf-8")
-
-
 def test_the_page_is_whole_and_needs_nothing_else(run: RunFolder) -> None:
     text = score_and_report(run)
     page = Page(text)
@@ -91,6 +62,7 @@ def test_the_page_is_whole_and_needs_nothing_else(run: RunFolder) -> None:
     assert not re.search(r"https?://(?!www\.w3\.org)", text)
     assert "@import" not in text
     assert page.boxes == {"truth": 6, "found": 6}  # three frames, in the image and from above
+    assert text.count('class="cloud" data-colour') == 3
     for caption in ("sparse depth", "completed depth", "foreground", "background", "sigma", "true depth", "error"):
         assert caption in text
     assert "grid sampling" in text
@@ -224,21 +196,3 @@ def test_small_functions() -> None:
     assert mean_of([{"a": 1.0, "b": 2.0}, {"a": 3.0}]) == {"a": 2.0}
     steps = [[{"step": "s", "in": 10, "out": 4}], [{"step": "s", "in": 20, "out": 6}]]
     assert mean_steps(steps) == [{"step": "s", "in": 15, "out": 5}]
-
-
-@pytest.mark.slow
-def test_a_browser_reports_no_error(run: RunFolder, tmp_path: Path) -> None:
-    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("no Chromium on this machine")
-    score_and_report(run)
-    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0"]
-    command += [
-        f"--user-data-dir={tmp_path / 'profile'}",
-        "--virtual-time-budget=3000",
-        "--dump-dom",
-        run.report.as_uri(),
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=110, check=False)
-    assert ":CONSOLE" not in done.stderr
-    assert '<output id="score-text">all</output>' in done.stdout  # the script ran
