@@ -23,7 +23,7 @@ from torch import nn
 from completion.importers import import_checkpoint, import_with_spec
 from completion.models import ModelSpec, build_model
 from completion.readout import default_read_out
-from completion.state_dicts import CheckpointError, fill
+from completion.state_dicts import CheckpointError, fill, match
 
 __all__ = [
     "Card",
@@ -103,7 +103,8 @@ def read_card(weights_path: Path) -> Card:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["format"] != FORMAT:
             raise CheckpointError(f"{path}: expected format {FORMAT!r}, got {content['format']!r}")
-        return Card(ModelSpec(**content["model"]), content["read_out"], content["training"], content["sha256"])
+        spec = ModelSpec(**content["model"])
+        return Card(spec, str(content["read_out"]), dict(content["training"]), str(content["sha256"]))
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, CheckpointError):
             raise
@@ -128,10 +129,24 @@ def load_checkpoint(path_or_name: str | Path) -> tuple[nn.Module, Card]:
         tensors = load_tensors(content)
     except SafetensorError as error:
         raise CheckpointError(f"{weights_path}: not a readable safetensors file: {error}") from error
-    with torch.random.fork_rng(devices=[]):
-        model = build_model(card.model)
+    model = _fitting_model(card.model, tensors, weights_path)
     fill(model, tensors, str(weights_path))
     return model.eval(), card
+
+
+def _fitting_model(spec: ModelSpec, tensors: Mapping[str, torch.Tensor], path: Path) -> nn.Module:
+    """A network of the card's kind that these tensors fit; a card of absurd size is refused before memory is taken."""
+    try:
+        with torch.device("meta"):
+            found = match(build_model(spec), tensors)
+        if found.fits:
+            with torch.random.fork_rng(devices=[]):
+                return build_model(spec)
+    except (TypeError, ValueError, RuntimeError, IndexError, KeyError, ArithmeticError) as error:
+        raise CheckpointError(
+            f"{path.with_suffix('.json')}: no network can be built from this card: {error}"
+        ) from error
+    raise CheckpointError(f"{path}: does not fit the network of its card: {found}")
 
 
 def convert_checkpoint(path: str | Path, architecture: str, out: str | Path) -> Path:

@@ -42,6 +42,8 @@ class ModelSpec:
     def __post_init__(self) -> None:
         if self.architecture not in MODELS:
             raise ValueError(f"architecture: expected one of {', '.join(sorted(MODELS))}, got {self.architecture!r}")
+        if not isinstance(self.arguments, Mapping):
+            raise ValueError(f"arguments: expected names with values, got {self.arguments!r}")
         if self.rgb not in RGB_SCALINGS:
             raise ValueError(f"rgb: expected one of {', '.join(RGB_SCALINGS)}, got {self.rgb!r}")
         if self.output not in OUTPUTS:

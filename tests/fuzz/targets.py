@@ -205,11 +205,21 @@ def _changed(samples: Callable[[], tuple[bytes, ...]]) -> Callable[[], st.Search
     return lambda: mutated(samples())
 
 
+def card_with(place: tuple[str, ...], value: object) -> bytes:
+    """The good checkpoint with one value of its card replaced."""
+    card, _, weights = _checkpoint_samples()[0].partition(b"\0")
+    changed = json.loads(card)
+    section = changed
+    for name in place[:-1]:
+        section = section[name]
+    section[place[-1]] = value
+    return json.dumps(changed).encode() + b"\0" + weights
+
+
 def _card_and_weights() -> st.SearchStrategy[bytes]:
     """Bytes changed anywhere, or one value of the card replaced by any JSON."""
     (sample,) = _checkpoint_samples()
-    card, _, weights = sample.partition(b"\0")
-    fields = json.loads(card)
+    fields = json.loads(sample.partition(b"\0")[0])
     values = st.recursive(
         st.none() | st.booleans() | st.integers(-2, 10**6) | st.floats() | st.text(max_size=5),
         lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
@@ -217,16 +227,7 @@ def _card_and_weights() -> st.SearchStrategy[bytes]:
     )
     names = [(name,) for name in fields] + [("model", name) for name in fields["model"]]
     names += [("model", "arguments", name) for name in fields["model"]["arguments"]]
-
-    def with_value(place: tuple[str, ...], value: object) -> bytes:
-        changed = json.loads(card)
-        section = changed
-        for name in place[:-1]:
-            section = section[name]
-        section[place[-1]] = value
-        return json.dumps(changed).encode() + b"\0" + weights
-
-    return mutated((sample,)) | st.builds(with_value, st.sampled_from(names), values)
+    return mutated((sample,)) | st.builds(card_with, st.sampled_from(names), values)
 
 
 TARGETS: dict[str, Target] = {

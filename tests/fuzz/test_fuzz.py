@@ -6,7 +6,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.fuzz.targets import TARGETS, try_file
+from tests.fuzz.targets import TARGETS, card_with, try_file
 
 EXAMPLES = 60
 # Long enough for a busy machine; a reader that hangs or takes gigabytes is over it.
@@ -27,3 +27,11 @@ def test_a_damaged_file_is_taken_or_refused_and_nothing_else(name: str) -> None:
         try_file(name, data.draw(TARGETS[name].files()))
 
     tried()
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [(("sha256",), None), (("training",), 3), (("model", "arguments"), None), (("model", "arguments", "width"), 10**6)],
+)
+def test_cards_that_were_found_once(place: tuple[str, ...], value: object) -> None:
+    assert not try_file("checkpoint", card_with(place, value))
