@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from completion.types import CompletedDepth
+from detection.evaluation.curves import Curve
 from detection.evaluation.difficulty import LEVELS
+from detection.evaluation.protocol import Target
 from detection.kitti_format import KittiObject
 from pipeline.config import Config
 from pipeline.data import Dataset, Frame
@@ -113,7 +115,7 @@ def _drawings(
 ) -> list[tuple[str, Callable[[], Figure]]]:
     """(file name, function that draws) of every figure this run has data for."""
     drawings: list[tuple[str, Callable[[], Figure]]] = []
-    if judged.evaluation is not None:
+    if _found_targets(judged):
         drawings.append(("precision_recall", lambda: precision_recall(judged)))
     material = _richest(run, dataset, frames)
     if material is None:
@@ -226,16 +228,18 @@ def detections(material: Material) -> Figure:
 
 def precision_recall(judged: Judged) -> Figure:
     """3D and bird's-eye precision over recall of every class of which something was found."""
-    assert judged.evaluation is not None
-    targets = [
-        target
-        for metric in ("3d", "bev")
-        for target in strictest(judged.evaluation, metric)
-        if any(len(curve.thresholds) for curve in judged.evaluation.curves(target))
-    ]
-    figure, axes = panels.grid(len(targets), min(3, max(len(targets), 1)), WIDTH, 2.0)
-    for axis, target in zip(axes, targets):
-        curves = dict(zip(LEVELS, judged.evaluation.curves(target)))
-        panels.curves(axis, {level: curve.precision() for level, curve in curves.items()})
+    targets = _found_targets(judged)
+    figure, axes = panels.grid(len(targets), min(3, len(targets)), WIDTH, 2.0)
+    for axis, (target, curves) in zip(axes, targets):
+        panels.curves(axis, {level: curve.precision() for level, curve in zip(LEVELS, curves)})
         axis.set_title(f"{target.cls}, {'3D' if target.metric == '3d' else 'bird’s eye'}, IoU {target.iou:g}")
     return figure
+
+
+def _found_targets(judged: Judged) -> list[tuple[Target, tuple[Curve, ...]]]:
+    """Targets with at least one true positive, and their curves."""
+    if judged.evaluation is None:
+        return []
+    targets = [target for metric in ("3d", "bev") for target in strictest(judged.evaluation, metric)]
+    pairs = [(target, judged.evaluation.curves(target)) for target in targets]
+    return [(target, curves) for target, curves in pairs if any(len(curve.thresholds) for curve in curves)]

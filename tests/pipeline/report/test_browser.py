@@ -32,12 +32,14 @@ addEventListener("load", () => {
   said.turned = view.yaw !== start[0] && view.pitch > start[1] && view.distance < start[2];
   key(canvas, "r");
   said.reset = [view.yaw, view.pitch, view.distance].join() === start.join();
-  const at = (kind, x, y, id) => canvas.dispatchEvent(new PointerEvent(kind, { pointerId: id, clientX: x, clientY: y, bubbles: true }));
+  const pointer = (kind, x, y, id) => new PointerEvent(kind, { pointerId: id, clientX: x, clientY: y, bubbles: true });
+  const at = (...event) => canvas.dispatchEvent(pointer(...event));
   canvas.setPointerCapture = () => {};
   at("pointerdown", 100, 100, 1); at("pointermove", 140, 110, 1);
   said.dragged = view.yaw !== start[0];
   const far = view.distance;
-  at("pointerdown", 240, 110, 2); at("pointermove", 340, 110, 2); at("pointerup", 340, 110, 2); at("pointerup", 140, 110, 1);
+  at("pointerdown", 240, 110, 2); at("pointermove", 340, 110, 2);
+  at("pointerup", 340, 110, 2); at("pointerup", 140, 110, 1);
   said.pinched = view.distance < far;
   const select = cloud.querySelector("select");
   said.colours = [...select.options].map((option) => option.value).join();
@@ -51,7 +53,7 @@ addEventListener("load", () => {
   key(document.body, "1");
   said.hidden = getComputedStyle(document.querySelector(".box.truth")).display;
   const map = document.querySelectorAll(".pointed")[1], edge = map.getBoundingClientRect();
-  map.dispatchEvent(new PointerEvent("pointermove", { bubbles: true, clientX: edge.left + edge.width / 2, clientY: edge.top + 0.6 * edge.height }));
+  map.dispatchEvent(pointer("pointermove", edge.left + edge.width / 2, edge.top + 0.6 * edge.height, 3));
   said.values = [...map.closest("article").querySelectorAll("output")].map((out) => out.textContent).join("|");
   const slider = document.getElementById("score");
   slider.value = 100; slider.dispatchEvent(new Event("input"));
