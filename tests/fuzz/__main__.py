@@ -72,7 +72,8 @@ def main() -> int:
     args = parser.parse_args()
     limit = int(args.memory_gb * 1e9)
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    return 0 if all([fuzz(name, args.minutes, args.finds) for name in args.target or TARGETS]) else 1
+    clean = [fuzz(name, args.minutes, args.finds) for name in args.target or TARGETS]
+    return 0 if all(clean) else 1
 
 
 if __name__ == "__main__":
