@@ -13,6 +13,7 @@ from pathlib import Path
 import torch
 
 from completion.models import default_spec
+from completion.objectives import Objective, default_kind
 from completion.samples import Augmentation, TrainingSample
 from completion.train import TrainSettings, train
 from tests.completion.scenes import Streets, street
@@ -35,8 +36,10 @@ class Mortal(Streets):
 
 
 def settings(architecture: str, accumulate: int = 2) -> TrainSettings:
+    spec = default_spec(architecture, **ARGUMENTS[architecture])
     return TrainSettings(
-        default_spec(architecture, **ARGUMENTS[architecture]),
+        spec,
+        Objective(default_kind(spec)),
         augmentation=Augmentation((64, 64), noise=4.0, drop=0.1),
         epochs=2,
         steps_per_epoch=8,
