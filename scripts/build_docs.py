@@ -37,9 +37,9 @@ API: dict[str, tuple[str, ...]] = {
         "pipeline.pointcloud.pseudo_sigma", "pipeline.simulation.synth", "pipeline.simulation.noise", "pipeline.config",
     ),
 }  # fmt: skip
-# Long lines of docstrings wrap; pictures drawn for paper stand on white in the dark colours too.
+# Long lines of docstrings and commands wrap; pictures drawn for paper stand on white in the dark colours too.
 STYLE = """\
-.language-text code { white-space: pre-wrap; }
+.language-text code, .language-sh code, .language-bash code { white-space: pre-wrap; overflow-wrap: anywhere; }
 .md-typeset img { background: white; border-radius: 4px; }
 .md-typeset table code { word-break: normal; overflow-wrap: anywhere; }
 @media (max-width: 40em) {
