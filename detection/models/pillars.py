@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from detection.models.fully_connected import EPS, MOMENTUM
 from detection.models.layers import RowBatchNorm, maximum
+from detection.ops.sparse_conv import Sites
 from detection.ops.voxelize import VoxelGrid, Voxels, voxelize
 
 
@@ -43,11 +44,8 @@ class PillarEncoder(nn.Module):
         frames = [voxelize(self.grid.crop(cloud), self.grid, limit) for cloud in clouds]
         rows = torch.cat([self.decorated(voxels) for voxels in frames])
         features = cast(Tensor, self.pfn_layers[0](rows)) if len(rows) else rows.new_zeros(0, self.channels)
-        _, height, width = self.grid.shape
-        index = [v.coords[:, 1] * width + v.coords[:, 2] + b * height * width for b, v in enumerate(frames)]
-        canvas = features.new_zeros(len(frames) * height * width, self.channels)
-        canvas = canvas.index_copy(0, torch.cat(index), features)
-        return canvas.view(len(frames), height, width, -1).permute(0, 3, 1, 2)
+        coords = torch.cat([F.pad(voxels.coords, (1, 0), value=b) for b, voxels in enumerate(frames)])
+        return Sites(coords, self.grid.shape, len(frames)).to_dense(features).squeeze(2)
 
     def decorated(self, voxels: Voxels) -> Tensor:
         """(V, T, 3 + E + 6): the point, its offset to the mean of the pillar's points, its offset to the centre.

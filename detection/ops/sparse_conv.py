@@ -96,10 +96,12 @@ class Sites:
 
     def to_dense(self, features: Tensor) -> Tensor:
         """(N, C) features -> (B, C, Z, Y, X), zero elsewhere; differentiable."""
-        cells = self.batch * math.prod(self.shape)
-        dense = features.new_zeros(cells, features.shape[1])
-        dense = dense.index_copy(0, _sparse_torch.linear_keys(self.coords, self.shape), features)
-        return dense.view(self.batch, *self.shape, -1).permute(0, 4, 1, 2, 3)
+        frame = self.coords[:, 0]
+        cell = _sparse_torch.linear_keys(self.coords, self.shape) - frame * math.prod(self.shape)
+        # Few rows are written straight to their planes; a row-wise grid would have to be transposed as a whole.
+        dense = features.new_zeros(self.batch, features.shape[1], math.prod(self.shape))
+        dense[frame, :, cell] = features
+        return dense.view(self.batch, -1, *self.shape)
 
 
 def _empty_table(entries: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
