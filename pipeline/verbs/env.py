@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def environment(folder: Path) -> dict[str, Any]:
-    """Everything the report says, as plain values: versions, cores, threads, memory, disk, GPU, extras, weights, remarks.
+    """Everything the report says, as plain values: versions, cores, threads, memory, disk, GPU, extras, weights.
 
     folder  its disk is looked at; the nearest existing parent when it does not exist yet. Sizes in GB (1e9 bytes)
     """
@@ -78,10 +78,8 @@ def remarks(found: dict[str, Any]) -> list[str]:
     if missing:
         notes.append(f"packages without a version: {', '.join(missing)}; install this package with its dependencies")
     if found["disk"]["free_gb"] < LEAST_FREE_GB:
-        notes.append(
-            f"{found['disk']['free_gb']:.1f} GB free at {found['disk']['folder']}; ask a run what it needs with --dry-run, "
-            "or choose another disk with --out"
-        )
+        place = f"{found['disk']['free_gb']:.1f} GB free at {found['disk']['folder']}"
+        notes.append(f"{place}; ask a run what it needs with --dry-run, or choose another disk with --out")
     available = found["memory_gb"]["available"]
     if available is not None and available < 1.5 * found["cores"]:
         notes.append(f"{available:.1f} GB of memory free for {found['cores']} processes; give fewer --workers")

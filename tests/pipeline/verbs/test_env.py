@@ -18,7 +18,7 @@ from pipeline.verbs.shell import script
 def test_report_as_json(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["--stage", "env", "--json", "--out", str(tmp_path / "not" / "yet")]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["versions"]["torch"] and found["versions"]["numpy"]
+    assert found["versions"]["torch"]
     assert found["disk"]["folder"] == str(tmp_path)
     assert found["cores"] >= 1
 
@@ -26,7 +26,8 @@ def test_report_as_json(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> N
 def test_report_as_text_says_where_python_is(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--stage", "env"]) == 0
     shown = capsys.readouterr().out
-    assert "executable" in shown and "GB free at" in shown
+    assert "executable" in shown
+    assert "GB free at" in shown
 
 
 def test_remarks_name_the_trouble(tmp_path: Path) -> None:
