@@ -81,7 +81,14 @@ def read_cloud(path: str | Path) -> Cloud:
     data = read_bytes(path, "a point cloud")
     if path.suffix == ".npy":
         return _read_npy(data, path)
-    cloud = _read_ply(data, path) if path.suffix == ".ply" else _read_pcd(data, path)
+    try:
+        # Numbers beyond float32 become infinite here; `read_points` refuses them.
+        with np.errstate(over="ignore", invalid="ignore"):
+            cloud = _read_ply(data, path) if path.suffix == ".ply" else _read_pcd(data, path)
+    except (IndexError, ValueError, TypeError, OverflowError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(path, f"a whole {path.suffix} header", f"words that make none ({error})") from None
     if cloud.columns[:3] != ("x", "y", "z") and not {"x", "y", "z"} <= set(cloud.columns):
         raise DataError(path, "columns x y z", ", ".join(cloud.columns))
     return cloud
@@ -164,6 +171,8 @@ def _read_pcd(data: bytes, path: Path) -> Cloud:
 
 def _table(data: bytes, count: int, names: list[str], types: list[str], text: bool, path: Path) -> Cloud:
     """The rows behind a header, as float32 columns."""
+    if count < 0:
+        raise DataError(path, "a number of points", f"{count}")
     if text:
         words = data.split()[: count * len(names)]
         if len(words) != count * len(names):

@@ -35,3 +35,17 @@ def test_a_damaged_file_is_taken_or_refused_and_nothing_else(name: str) -> None:
 )
 def test_cards_that_were_found_once(place: tuple[str, ...], value: object) -> None:
     assert not try_file("checkpoint", card_with(place, value))
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("ply", b"ply\nformat\nelement vertex 1\nproperty float x\nend_header\n"),
+        ("ply", b"ply\nformat ascii 1.0\nelement vertex many\nproperty float x\nend_header\n"),
+        ("ply", b"ply\nformat binary_little_endian 1.0\nelement vertex -1\nproperty float x\nend_header\n1234"),
+        ("pcd", b"FIELDS x y z\nSIZE 3 3 3\nTYPE F F F\nPOINTS 1\nDATA binary\n123456789"),
+        ("pcd", b"FIELDS x y z\nSIZE 4\nTYPE F\nPOINTS 1\nDATA binary\n123456789012"),
+    ],
+)
+def test_headers_that_were_found_once(name: str, data: bytes) -> None:
+    assert not try_file(name, data)
