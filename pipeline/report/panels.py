@@ -260,7 +260,8 @@ def _noise_from_above(
     middle = np.median(noisy if len(noisy) else np.array([[20.0, 0, 0]]), axis=0)
     axis.set(xlim=(-middle[1] - 9, -middle[1] + 9), ylim=(middle[0] - 7, middle[0] + 7), aspect="equal")
     labels_of = frame.labels if frame.has("labels") else []
-    for objects, colour in ((labels_of, TRUTH), (found, FOUND)):
+    # Black, because the usual colour of predicted boxes is that of a kind of noise here.
+    for objects, colour in ((labels_of, TRUTH), (found, "black")):
         footprints(axis, frame, objects, colour)
 
 
