@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.cli import STAGE_HELP, main
 from pipeline.verbs import VERBS
-from pipeline.verbs.env import environment, remarks
+from pipeline.verbs.env import EXTRAS, environment, remarks
 from pipeline.verbs.shell import script
 
 
@@ -68,9 +68,17 @@ def test_tab_offers_every_stage_and_verb() -> None:
 
 def test_tab_offers_the_options_of_the_stage() -> None:
     assert completions("run_pipeline", "--stage", "export", "--form") == {"--format"}
-    assert completions("run_pipeline", "--stage", "complete", "--form") == set()
+    assert completions("run_pipeline", "--stage", "complete", "--virt") == set()
     assert completions("run_pipeline", "--stage", "complete", "--sha") == {"--shard"}
 
 
 def test_zsh_uses_its_bash_layer() -> None:
     assert script("zsh").startswith("autoload -Uz bashcompinit")
+
+
+def test_extras_are_those_of_the_package() -> None:
+    """Every optional extra but the developers' own is reported."""
+    text = (Path(__file__).resolve().parents[3] / "pyproject.toml").read_text(encoding="utf-8")
+    table = text.split("[project.optional-dependencies]")[1].split("[project.scripts]")[0]
+    declared = {line.split(" = ")[0] for line in table.splitlines() if " = [" in line}
+    assert set(EXTRAS) == declared - {"dev", "bench"}
