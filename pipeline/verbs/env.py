@@ -21,7 +21,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "openvino": ("openvino",),
     "ray": ("ray",),
     "hf": ("transformers",),
-    "viewer": ("rerun", "foxglove", "mcap"),
+    "viewer": ("rerun", "mcap"),
     "tensorboard": ("tensorboard",),
     "parquet": ("pyarrow",),
     "nyu": ("h5py",),

@@ -19,8 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--architecture",
         required=True,
         metavar="NAME",
-        help="twise, twise_maxpool, msg_chn, msg_chn_wacv, sparse_to_dense; pointrcnn, epnet, openpcdet_pointrcnn; "
-        "or 'results' for a result.pkl",
+        help="twise, twise_maxpool, msg_chn, msg_chn_wacv, sparse_to_dense; pointrcnn, epnet, openpcdet_pointrcnn, "
+        "pointpillar, second, voxel_rcnn, pv_rcnn; or 'results' for a result.pkl",
     )
     out = "NAME.safetensors, or the folder of result files"
     parser.add_argument("--out", type=Path, required=True, metavar="FILE|DIR", help=out)
