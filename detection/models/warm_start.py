@@ -5,12 +5,16 @@ from __future__ import annotations
 import torch
 from torch import nn
 
+# Input columns that stand behind the extra ones: a pillar's offsets to its mean and to its centre.
+_BEHIND = {"vfe.pfn_layers.0.linear.weight": 6}
+
 
 def copy_matching(source: nn.Module, target: nn.Module) -> list[str]:
     """Copy every weight; where `target` has more input columns, the new ones start at zero, so it computes the same.
 
     Extra point channels are the last columns of the first set abstraction (x y z, extra) and of the last feature
-    propagation (interpolated, skip). Returns the names that were widened.
+    propagation (interpolated, skip); voxel encoders have them behind the point's others.
+    Returns the names that were widened.
     Raises ValueError when names differ or a shape differs in another way.
     """
     old, new = source.state_dict(), target.state_dict()
@@ -22,15 +26,25 @@ def copy_matching(source: nn.Module, target: nn.Module) -> list[str]:
         if known.shape == value.shape:
             value.copy_(known)
             continue
-        same_rest = (
-            known.dim() == value.dim() > 1 and known.shape[0] == value.shape[0] and known.shape[2:] == value.shape[2:]
-        )
-        if not same_rest or known.shape[1] > value.shape[1]:
+        axis = _widened_axis(known.shape, value.shape)
+        if axis is None:
             raise ValueError(
                 f"warm start: {name} is {tuple(known.shape)}, expected {tuple(value.shape)} or fewer columns"
             )
+        behind = _BEHIND.get(name, 0)
+        front, last = known.shape[axis] - behind, value.shape[axis] - behind
         with torch.no_grad():
             value.zero_()
-            value[:, : known.shape[1]].copy_(known)
+            value.narrow(axis, 0, front).copy_(known.narrow(axis, 0, front))
+            value.narrow(axis, last, behind).copy_(known.narrow(axis, front, behind))
         widened.append(name)
     return widened
+
+
+def _widened_axis(known: torch.Size, wanted: torch.Size) -> int | None:
+    """The input axis along which alone `wanted` is longer: 1, or the last one of a sparse convolution's weight."""
+    axis = 4 if len(wanted) == 5 else 1
+    if not len(known) == len(wanted) > axis or known[axis] > wanted[axis]:
+        return None
+    same = [known[k] == wanted[k] for k in range(len(wanted)) if k != axis]
+    return axis if all(same) else None

@@ -13,6 +13,9 @@ from detection.checkpoints import load_tensors
 from detection.infer import Detector, load_detector
 from detection.kitti_format import KittiObject, boxes_of
 from detection.models.batch import PointBatch
+from detection.models.pointpillars import PointPillars
+from detection.models.pv_rcnn import PVRCNN
+from detection.models.warm_start import copy_matching
 from detection.ops import iou_3d
 from detection.optimiser import OneCycleSettings
 from detection.train import Trainer, TrainSettings, train
@@ -104,3 +107,23 @@ def test_two_frames_are_learnt_by_heart(preset, steps, overlap) -> None:
         best = iou_3d(found.boxes.values, boxes_of(labels).values).max(axis=0)
         assert best.min() > overlap
         assert set(found.classes) == {"Car"}
+
+
+@pytest.mark.parametrize("build", [tiny.tiny_pillars, tiny.tiny_pv_rcnn])
+@torch.no_grad()
+def test_a_warm_start_with_one_more_column_computes_the_same(build) -> None:
+    old = build()
+    if build is tiny.tiny_pillars:
+        new: torch.nn.Module = PointPillars(replace(old.settings, point_channels=5)).eval()
+    else:
+        wider = replace(old.settings, point_channels=5)
+        new = PVRCNN(wider, old.stages, old.pfe.settings, old.roi_head.settings).eval()
+    widened = copy_matching(old, new)
+    assert len(widened) == (1 if build is tiny.tiny_pillars else 3)
+    points = tiny.cloud()
+    more = torch.cat([points, torch.rand(len(points), 1)], dim=1)
+    before, after = old([points]), new([more])
+    first = (before, after) if build is tiny.tiny_pillars else (before.first, after.first)
+    torch.testing.assert_close(first[1].bev, first[0].bev)
+    if build is not tiny.tiny_pillars:
+        torch.testing.assert_close(after.refined.reg, before.refined.reg)
