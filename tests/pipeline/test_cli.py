@@ -29,9 +29,9 @@ def data(tmp_path: Path) -> Path:
 
 
 def contents(run: Path) -> dict[str, bytes]:
-    """Everything the frame stages wrote, by relative path."""
+    """Everything the frame stages wrote, by relative path; what a kill left behind under a hidden name is no result."""
     folders = ("depth", "twin", "cloud", "detections")
-    files = (path for folder in folders for path in (run / folder).rglob("*") if path.is_file())
+    files = (path for folder in folders for path in (run / folder).rglob("[!.]*") if path.is_file())
     return {path.relative_to(run).as_posix(): path.read_bytes() for path in files}
 
 
