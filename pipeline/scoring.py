@@ -8,6 +8,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from detection.kitti_format import KittiObject
 from pipeline.config import Config
 from pipeline.data import Dataset, Frame
@@ -18,6 +21,9 @@ from pipeline.paths import RunFolder
 from pipeline.report.tables import markdown_tables
 from pipeline.runner.atomic import write_text
 from pipeline.runner.jobs import Failure
+
+# Share of pixels with a value from which ground truth counts as dense; KITTI's accumulated LiDAR has 16 to 30 %.
+DENSE_TRUTH = 0.5
 
 
 @dataclass
@@ -84,9 +90,24 @@ def _collect_depth(frame: Frame, files: FrameFiles, collected: Collected) -> Non
         return
     from completion.metrics import depth_metrics
 
-    target = frame.target_depth
+    target = scored_depth(frame)
     if (target > 0).any():
         collected.depth[frame.id] = depth_metrics(read_depth_png(path), target)
+
+
+def scored_depth(frame: Frame) -> NDArray[np.float32]:
+    """True depth (H, W) that completion is scored on, metres, 0 = not scored.
+
+    Truth measured by a LiDAR is taken whole, as the KITTI devkit does. Dense truth of a renderer reaches to the
+    horizon and above every ring; it is scored where a LiDAR measures: up to 80 m and below the topmost sample.
+    """
+    from completion.diagnostics import measured_region
+    from completion.types import DepthFrame
+
+    target = frame.target_depth
+    if (target > 0).mean() < DENSE_TRUTH:
+        return target
+    return measured_region(DepthFrame(frame.image, frame.sparse_depth, target))
 
 
 def scores(config: Config, collected: Collected) -> dict[str, Any]:
