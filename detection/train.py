@@ -213,9 +213,13 @@ class Trainer:
             raise ValueError("training: expected at least one frame, got an empty data source")
         self.settings, self.samples, self.device = settings, samples, torch.device(device)
         self.workers = _Workers.current()
+        if settings.preset not in PRESETS:
+            raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, got {settings.preset!r}")
         self.preset = PRESETS[settings.preset](**settings.options)
         torch.manual_seed(settings.seed)
         self.model = self.preset.build().to(self.device)
+        if not hasattr(self.model, "training_losses"):
+            raise ValueError(f"preset {settings.preset}: its network can be imported and run, but not trained")
         if settings.warm_start is not None:
             copy_matching(load_checkpoint(settings.warm_start)[0], self.model)
         self.optimiser = AdamOneCycle(self.model, settings.steps, settings.optimiser)

@@ -111,11 +111,19 @@ def thesis(features: tuple[str, ...] = (), dense: bool = True) -> Preset:
     return _published("thesis", settings, inputs, {"features": list(features), "dense": dense})
 
 
+def openpcdet_pointrcnn() -> Preset:
+    """OpenPCDet's PointRCNN, for imported weights: inference only, boxes in the LiDAR frame."""
+    inputs = InputSettings(16384, frame="lidar", features=("intensity",))
+    outputs = OutputSettings(0.1, 0.1, nms_per_class=False)
+    return Preset("openpcdet_pointrcnn", CLASSES, inputs, outputs, OpenPCDetPointRCNN)
+
+
 PRESETS: dict[str, Callable[..., Preset]] = {
     "small": small,
     "pointrcnn": pointrcnn,
     "pointrcnn2": pointrcnn2,
     "thesis": thesis,
+    "openpcdet_pointrcnn": openpcdet_pointrcnn,
     **LIDAR_PRESETS,
 }
 
@@ -128,13 +136,6 @@ def _fitting_pointrcnn(model: nn.Module) -> Preset:
 def _fitting_epnet(model: nn.Module) -> Preset:
     settings = cast(PointRCNN, model).settings
     return pointrcnn2(("intensity",) * settings.extra_channels, settings.iou_branch)
-
-
-def _openpcdet_pointrcnn(model: nn.Module) -> Preset:
-    inputs = InputSettings(16384, frame="lidar", features=("intensity",))
-    return Preset(
-        "openpcdet_pointrcnn", CLASSES, inputs, OutputSettings(0.1, 0.1, nms_per_class=False), OpenPCDetPointRCNN
-    )
 
 
 def _fitting_openpcdet(architecture: str) -> Callable[[nn.Module], Preset]:
@@ -152,6 +153,6 @@ def _fitting_openpcdet(architecture: str) -> Callable[[nn.Module], Preset]:
 IMPORTED_PRESETS: dict[str, Callable[[nn.Module], Preset]] = {
     "pointrcnn": _fitting_pointrcnn,
     "epnet": _fitting_epnet,
-    "openpcdet_pointrcnn": _openpcdet_pointrcnn,
+    "openpcdet_pointrcnn": lambda model: openpcdet_pointrcnn(),
     **{architecture: _fitting_openpcdet(architecture) for architecture in OPENPCDET_PRESETS},
 }

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from detection.checkpoints import save_checkpoint
+from detection.checkpoints import load_checkpoint, save_checkpoint
 from detection.infer import Detector, final_detections, imported_detector, load_detector, vote
 from detection.models.batch import RawDetections
 from detection.models.openpcdet_pointrcnn import OpenPCDetPointRCNN
-from detection.models.presets import OutputSettings, small
+from detection.models.presets import IMPORTED_PRESETS, OutputSettings, small
 from detection.types import PointFrame
 from tests.detection.scenes import IMAGE_SIZE, P2, T_CAM_VELO, box_frame
 
@@ -113,3 +113,15 @@ def test_imported_lidar_frame_detector_returns_camera_boxes(tmp_path) -> None:
     assert set(found.classes) <= {"Car", "Pedestrian", "Cyclist"}
     with pytest.raises(ValueError, match="unknown architecture"):
         imported_detector(tmp_path / "a.pth", "nothing")
+
+
+def test_an_imported_openpcdet_network_is_saved_and_loaded_as_ours(tmp_path) -> None:
+    torch.manual_seed(0)
+    model = OpenPCDetPointRCNN().eval()
+    preset = IMPORTED_PRESETS["openpcdet_pointrcnn"](model)
+    path = save_checkpoint(model, preset, tmp_path / "ours.safetensors", {})
+    loaded, again, _ = load_checkpoint(path)
+    assert again.inputs == preset.inputs
+    assert again.outputs == preset.outputs
+    for name, tensor in model.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], tensor), name

@@ -245,3 +245,12 @@ def test_box_frames_are_all_easy() -> None:
     for index in range(8):
         _, labels = box_frame(index)
         assert min(label.height_2d for label in labels) > 40
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("pointrnn", "expected one of small"), ("openpcdet_pointrcnn", "imported and run, but not trained")],
+)
+def test_a_preset_that_cannot_be_trained_is_refused(name, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        Trainer(TrainSettings(preset=name), BoxFrames(1), "cpu")
