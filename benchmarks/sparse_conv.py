@@ -37,6 +37,8 @@ def street_points(columns: int, seed: int = 0) -> Tensor:
     ray = np.stack(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation) + 0 * azimuth], -1
     ).reshape(-1, 3)
+    # A ray exactly along an axis never meets the planes across it.
+    ray = np.where(np.abs(ray) < 1e-9, 1e-9, ray)
     reach = np.minimum(np.where(ray[:, 2] < 0, -1.73 / np.minimum(ray[:, 2], -1e-9), 1e9), 10 / np.abs(ray[:, 1]))
     for x, y in zip(range(6, 70, 8), np.resize([4.0, -4.0, 5.0, -6.0], 8)):
         low, high = np.array([x, y - 0.8, -1.73]), np.array([x + 4.0, y + 0.8, -0.2])
