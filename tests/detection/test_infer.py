@@ -50,7 +50,9 @@ def test_nothing_visible_means_nothing_found(detector) -> None:
 
 
 def test_one_visible_point_is_enough(detector) -> None:
-    detector.detect(PointFrame(np.array([[20, 0, -1, 0.5]], np.float32), T_CAM_VELO, P2, IMAGE_SIZE, "one"))
+    found = detector.detect(PointFrame(np.array([[20, 0, -1, 0.5]], np.float32), T_CAM_VELO, P2, IMAGE_SIZE, "one"))
+    assert np.isfinite(found.boxes.values).all()
+    assert len(found.scores) == len(found.classes) == len(found)
 
 
 def test_missing_columns_are_named() -> None:
