@@ -12,7 +12,7 @@ from completion.analysis import expected_loss, relative_error_histograms
 from completion.types import FloatMap
 
 
-def _losses(gamma: float) -> dict[str, Callable[[Any], Any]]:
+def loss_curves(gamma: float) -> dict[str, Callable[[Any], Any]]:
     """Loss curves of Fig. 2.5 and 4.3 on NumPy errors in metres."""
     return {
         "MSE": np.square,
@@ -36,7 +36,7 @@ def plot_expected_losses(
     figure = Figure(figsize=(14, 5), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(2, 6)
-    for column, (name, loss) in enumerate(_losses(gamma).items()):
+    for column, (name, loss) in enumerate(loss_curves(gamma).items()):
         axes[0, column].plot(error, loss(error))
         axes[0, column].set(title=name, xlabel="estimate - truth [m]")
         expected = expected_loss(loss, estimate, depths, (probability, 1 - probability))

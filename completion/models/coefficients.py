@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from completion.depth_coefficients import Bins, encode
 from completion.models.blocks import require_multiple
 from completion.models.resnet import block_counts, conv3, resnet_layer
-from completion.models.sparse_to_dense import SCALE, Backbone
+from completion.models.sparse_to_dense import SCALE, WIDTH, Backbone
 
 DEPTH_FEATURES, COLOUR_FEATURES = 80, 48
 
@@ -95,9 +95,11 @@ class CoefficientSparseToDense(Backbone):
         count: int = 80,
         size: float = 1.0,
         layout: str = "guard",
+        width: int = WIDTH,
     ) -> None:
         bins = Bins(count, size, layout)
-        super().__init__(layers, bins.channels if coefficient_head else 1, bins.channels if coefficient_input else 1)
+        heads, depth_channels = (bins.channels if coded else 1 for coded in (coefficient_head, coefficient_input))
+        super().__init__(layers, heads, depth_channels, width=width)
         self.bins, self.coefficient_input, self.coefficient_head = bins, coefficient_input, coefficient_head
 
     def forward(self, sparse: Tensor, rgb: Tensor) -> tuple[Tensor]:

@@ -14,6 +14,7 @@ from completion.models.blocks import require_multiple
 from completion.models.resnet import block_counts, resnet_layer
 
 SCALE = 100.0  # metres per unit of the published head
+WIDTH = 64  # features of the published networks at full resolution
 SHALLOWEST = 0.9  # metres; the published evaluation never predicts less
 
 
@@ -34,27 +35,34 @@ class Backbone(nn.Module):
     """(B, D, H, W) depth and (B, 3 or 1, H, W) image -> (B, heads, H, W), H and W multiples of 16.
 
     depth_channels  input channels of the depth branch (1, or the bins of Depth Coefficients)
-    grey            the image is one grey channel (published "gd" models); both branches then have 32 features
+    grey            the image is one grey channel (published "gd" models); both branches then have half the features
+    width           features at full resolution (published: 64, a multiple of 4); every layer scales with it
     """
 
-    def __init__(self, layers: int, heads: int, depth_channels: int = 1, grey: bool = False) -> None:
+    def __init__(
+        self, layers: int, heads: int, depth_channels: int = 1, grey: bool = False, width: int = WIDTH
+    ) -> None:
         super().__init__()
+        if width < 4 or width % 4:
+            raise ValueError(f"width: expected a multiple of 4, got {width}")
         blocks = block_counts(layers)
-        depth_width, image_width = (32, 32) if grey else (16, 48)
+        depth_width = width // 2 if grey else width // 4
+        image_width = width - depth_width
         self.grey = grey
         self.conv1_d = _input(depth_channels, depth_width)
         self.conv1_img = _input(1 if grey else 3, image_width)
-        self.conv2 = resnet_layer(64, 64, blocks[0], 1)
-        self.conv3 = resnet_layer(64, 128, blocks[1], 2)
-        self.conv4 = resnet_layer(128, 256, blocks[2], 2)
-        self.conv5 = resnet_layer(256, 512, blocks[3], 2)
-        self.conv6 = _normalised(nn.Conv2d(512, 512, 3, stride=2, padding=1, bias=False), 512)
-        self.convt5 = _up(512, 256)
-        self.convt4 = _up(768, 128)
-        self.convt3 = _up(384, 64)
-        self.convt2 = _up(192, 64)
-        self.convt1 = _up(128, 64, stride=1)
-        self.convtf = nn.Conv2d(128, heads, 1)
+        w1, w2, w4, w8 = width, 2 * width, 4 * width, 8 * width
+        self.conv2 = resnet_layer(w1, w1, blocks[0], 1)
+        self.conv3 = resnet_layer(w1, w2, blocks[1], 2)
+        self.conv4 = resnet_layer(w2, w4, blocks[2], 2)
+        self.conv5 = resnet_layer(w4, w8, blocks[3], 2)
+        self.conv6 = _normalised(nn.Conv2d(w8, w8, 3, stride=2, padding=1, bias=False), w8)
+        self.convt5 = _up(w8, w4)
+        self.convt4 = _up(w4 + w8, w2)
+        self.convt3 = _up(w2 + w4, w1)
+        self.convt2 = _up(w1 + w2, w1)
+        self.convt1 = _up(w1 + w1, w1, stride=1)
+        self.convtf = nn.Conv2d(w1 + w1, heads, 1)
         self._initialise()
 
     def _initialise(self) -> None:
@@ -94,8 +102,8 @@ class SparseToDense(Backbone):
     In training mode 100 times the head; in evaluation mode relu(100 y - 0.9) + 0.9, so never below 0.9 m.
     """
 
-    def __init__(self, layers: int = 18, grey: bool = False) -> None:
-        super().__init__(layers, heads=1, grey=grey)
+    def __init__(self, layers: int = 18, grey: bool = False, width: int = WIDTH) -> None:
+        super().__init__(layers, heads=1, grey=grey, width=width)
 
     def forward(self, sparse: Tensor, rgb: Tensor) -> Tensor:
         require_multiple(sparse, rgb, 16)
@@ -106,8 +114,8 @@ class SparseToDense(Backbone):
 class TwinSparseToDense(Backbone):
     """TWISE on ResNet: `forward(sparse / 80, rgb / 255) -> (out,)`, out (B, 3, H, W): surfaces / 80 m, sigma logit."""
 
-    def __init__(self, layers: int = 18, grey: bool = False) -> None:
-        super().__init__(layers, heads=3, grey=grey)
+    def __init__(self, layers: int = 18, grey: bool = False, width: int = WIDTH) -> None:
+        super().__init__(layers, heads=3, grey=grey, width=width)
 
     def forward(self, sparse: Tensor, rgb: Tensor) -> tuple[Tensor]:
         require_multiple(sparse, rgb, 16)

@@ -1,0 +1,22 @@
+"""All tables and figures, by name."""
+
+from __future__ import annotations
+
+from pipeline.errors import UsageError
+from pipeline.experiments import chapter_2_3, chapter_4, chapter_5
+from pipeline.experiments.tables import Table
+from pipeline.settings import nearest_name
+
+TABLES: tuple[Table, ...] = (*chapter_2_3.TABLES, *chapter_4.TABLES, *chapter_5.TABLES)
+
+
+def find(kind: str, number: str) -> Table:
+    """The table or figure of this number. UsageError that names the nearest one."""
+    for table in TABLES:
+        if (table.kind, table.number) == (kind, number):
+            return table
+    for table in TABLES:
+        if table.number == number:
+            raise UsageError(f"no experiment for {kind} {number}; did you mean --{table.kind} {number}?")
+    known = [table.number for table in TABLES if table.kind == kind]
+    raise UsageError(f"no experiment for {kind} {number}; {nearest_name(number, known)} (--list shows all)")

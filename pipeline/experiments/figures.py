@@ -1,0 +1,169 @@
+"""One figure per table: ours beside the thesis', in colours that colour-blind readers tell apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from pipeline.experiments.intervals import Estimate, estimate
+from pipeline.experiments.plan import TableResult
+from pipeline.experiments.tables import Column, Row
+
+# Okabe and Ito's palette: blue ours, orange the thesis'.
+OURS, THEIRS, THIRD = "#0072B2", "#E69F00", "#009E73"
+MARKERS = "osD^vPX"
+
+
+def new_figure(width: float, height: float) -> Any:
+    """A figure that needs no display."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _ours(result: TableResult, row: Row, column: Column) -> Estimate | None:
+    return estimate(result.outcomes.get(row.label, []), row, column)
+
+
+def draw_dots(result: TableResult, figure: Any) -> None:
+    """Rows down, a panel per column: our mean with interval (dot), the thesis' value (diamond), each on its axis."""
+    table = result.table
+    axes = figure.subplots(1, len(table.columns), sharey=True, squeeze=False)[0]
+    for index, (axis, column) in enumerate(zip(axes, table.columns)):
+        printed = any(row.printed and row.printed[index] is not None for row in table.rows)
+        other = axis.twiny() if printed else None
+        for position, row in enumerate(table.rows):
+            found = _ours(result, row, column)
+            if found is not None:
+                axis.plot(found.mean, position - 0.12, "o", color=OURS)
+                axis.plot([found.low, found.high], [position - 0.12] * 2, color=OURS, linewidth=2)
+            if other is not None and row.printed and row.printed[index] is not None:
+                other.plot(row.printed[index], position + 0.12, "D", color=THEIRS, markersize=5)
+        axis.set_xlabel(column.heading, color=OURS, fontsize=8)
+        axis.tick_params(axis="x", labelcolor=OURS, labelsize=7)
+        axis.grid(axis="y", alpha=0.3)
+        if other is not None:
+            other.tick_params(axis="x", labelcolor=THEIRS, labelsize=7)
+    axes[0].set_yticks(range(len(table.rows)), [row.label for row in table.rows], fontsize=8)
+    axes[0].set_ylim(len(table.rows) - 0.5, -0.5)
+
+
+def _series(result: TableResult) -> dict[str, list[tuple[str, Row]]]:
+    """Rows "64R TWISE" or "gamma 2" as (tick, row) by series; labels differ in one number."""
+    series: dict[str, list[tuple[str, Row]]] = {}
+    for row in result.table.rows:
+        first, _, rest = row.label.partition(" ")
+        name, tick = (rest, first) if first[:1].isdigit() else (first, rest)
+        series.setdefault(name, []).append((tick, row))
+    return series
+
+
+def draw_curve(result: TableResult, figure: Any) -> None:
+    """A panel per column: value against gamma or LiDAR rows; ours solid with intervals, the thesis' dashed."""
+    table = result.table
+    axes = figure.subplots(1, len(table.columns), squeeze=False)[0]
+    colours = dict(zip(_series(result), (OURS, THEIRS, THIRD, "#CC79A7", "#56B4E9")))
+    for index, (axis, column) in enumerate(zip(axes, table.columns)):
+        printed_axis = (
+            axis.twinx() if any(row.printed and row.printed[index] is not None for row in table.rows) else None
+        )
+        for marker, (name, rows) in zip(MARKERS, _series(result).items()):
+            found = [(position, _ours(result, row, column)) for position, (_, row) in enumerate(rows)]
+            done = [(position, one) for position, one in found if one is not None]
+            axis.plot(
+                [p for p, _ in done], [one.mean for _, one in done], f"{marker}-", color=colours[name], label=name
+            )
+            for position, one in done:
+                axis.plot([position] * 2, [one.low, one.high], color=colours[name], linewidth=1.5)
+            theirs = [(p, row.printed[index]) for p, (_, row) in enumerate(rows) if row.printed]
+            theirs = [(p, value) for p, value in theirs if value is not None]
+            if printed_axis is not None:
+                printed_axis.plot(*zip(*theirs), f"{marker}--", color=colours[name], alpha=0.5, markersize=4)
+        ticks = [tick for tick, _ in next(iter(_series(result).values()))]
+        axis.set_xticks(range(len(ticks)), ticks, fontsize=8)
+        axis.set_title(column.heading, fontsize=9)
+        axis.tick_params(axis="y", labelsize=7)
+        if printed_axis is not None:
+            printed_axis.tick_params(axis="y", labelsize=7, colors="grey")
+    axes[0].legend(fontsize=7)
+
+
+def draw_scatter(result: TableResult, figure: Any) -> None:
+    """Fig. 4.11 (b, c): semi-dense against clean for MAE and RMSE; networks of one backbone are joined."""
+    axes = figure.subplots(1, 2)
+    for axis, key in zip(axes, ("mae_mm", "rmse_mm")):
+        column = result.table.column(key)
+        points: dict[str, list[tuple[float, float, str]]] = {}
+        for row in result.table.rows:
+            name, _, kind = row.label.partition(", ")
+            if kind != "clean":
+                continue
+            clean, noisy = (_ours(result, result.table.row(f"{name}, {gt}"), column) for gt in ("clean", "semi-dense"))
+            if clean is not None and noisy is not None:
+                backbone, _, loss = name.partition(" ")
+                points.setdefault(backbone, []).append((clean.mean, noisy.mean, loss))
+        for colour, marker, (backbone, found) in zip((OURS, THEIRS), MARKERS, sorted(points.items())):
+            found.sort()
+            axis.plot([p[0] for p in found], [p[1] for p in found], f"{marker}-", color=colour, label=backbone)
+            for x, y, loss in found:
+                axis.annotate(loss, (x, y), textcoords="offset points", xytext=(4, 4), fontsize=7)
+        axis.set(xlabel=f"{column.heading}, clean", ylabel=f"{column.heading}, semi-dense")
+        axis.legend(fontsize=8)
+
+
+def draw_expected_loss(result: TableResult, figure: Any) -> None:
+    """Fig. 2.5 and 4.3: each loss above, its expectation at a pixel of two possible depths below."""
+    import numpy as np
+
+    from completion.analysis import expected_loss
+    from completion.figures import loss_curves
+
+    rows = [row for row in result.table.rows if row.recipe is not None]
+    axes = figure.subplots(2, len(rows), squeeze=False)
+    for column, row in enumerate(rows):
+        assert row.recipe is not None
+        settings = row.recipe.settings
+        loss = loss_curves(float(settings["gamma"]))[row.label]
+        near, far = settings["depths"]
+        error, depth = np.linspace(-3, 3, 601), np.linspace(near - 2, far + 2, 1401)
+        shares = (settings["probability"], 1 - settings["probability"])
+        axes[0, column].plot(error, loss(error), color=OURS)
+        axes[0, column].set(title=row.label, xlabel="estimate - truth [m]")
+        axes[1, column].plot(depth, expected_loss(loss, depth, (near, far), shares), color=THEIRS)
+        axes[1, column].set(xlabel="estimate [m]", ylabel="expected loss" if column == 0 else "")
+        for x in (near, far):
+            axes[1, column].axvline(x, color="grey", linewidth=0.8, linestyle=":")
+
+
+DRAWINGS: dict[str, Callable[[TableResult, Any], None]] = {
+    "dots": draw_dots,
+    "curve": draw_curve,
+    "scatter": draw_scatter,
+    "expected_loss": draw_expected_loss,
+}
+LEGENDS = {
+    "dots": "blue dots: ours with 95 % interval; orange diamonds: thesis (upper axis)",
+    "curve": "solid: ours with 95 % interval; dashed: thesis (right axis)",
+    "scatter": "means over seeds",
+}
+
+
+def draw(result: TableResult, path: Path) -> Path | None:
+    """Draws the figure of a table with any result; None when there is nothing to draw."""
+    table = result.table
+    if not result.outcomes:
+        return None
+    kind = table.drawing if table.drawing in DRAWINGS else "dots"
+    size = (3 + 1.9 * len(table.columns), 1.8 + 0.28 * len(table.rows)) if kind == "dots" else (11.0, 4.6)
+    figure = new_figure(*size)
+    DRAWINGS[kind](result, figure)
+    legend = LEGENDS.get(kind, "")
+    figure.suptitle(f"{table.heading}: {table.title}" + (f"\n{legend}" if legend else ""), fontsize=9)
+    temporary = path.with_name(f".writing-{path.name}")
+    figure.savefig(temporary, dpi=90, format="png", metadata={"Software": None})
+    temporary.replace(path)
+    return path

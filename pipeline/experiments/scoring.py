@@ -1,0 +1,112 @@
+"""Scores of a completion network on stored frames: every read-out, region and kind of ground truth in one pass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.experiments.frames import StoredFrame
+from pipeline.experiments.runs import Outcome
+
+if TYPE_CHECKING:
+    from completion.infer import NetworkCompleter
+    from completion.models import ModelSpec
+    from completion.types import CompletedDepth, DepthFrame
+
+Depth = NDArray[np.float32]
+# Kept per frame too, for intervals of a single seed.
+PER_FRAME = ("mae_mm", "rmse_mm", "tmae_mm", "trmse_mm", "mixed_percent", "edge_tmae_mm")
+
+
+def frame_scores(depth: Depth, target: Depth) -> dict[str, float]:
+    """`completion.metrics.depth_metrics` (KITTI's rules) and what happens at depth edges; NaN where there is none."""
+    from completion.analysis import mixed_share
+    from completion.diagnostics import edge_mask
+    from completion.metrics import depth_metrics
+
+    found = depth_metrics(depth, target)
+    valid = target > 0
+    error = 1000 * np.abs(depth - target)
+    edges = edge_mask(target) & valid
+    return found | {
+        "mixed_percent": 100 * mixed_share(depth, target),
+        "edge_tmae_mm": float(np.minimum(error[edges], 1000).mean()) if edges.any() else float("nan"),
+        "above_1m_percent": 100 * float((error[valid] > 1000).mean()),
+    }
+
+
+def read_outs(completer: NetworkCompleter, spec: ModelSpec, frame: DepthFrame) -> dict[str, Depth]:
+    """Depth by read-out name; the first is the network's default."""
+    from completion.readout import READ_OUTS_OF
+    from completion.twin_surface import fuse
+
+    completed = completer.complete(frame.sparse, frame.image)
+    first = completer.read_out
+    found = {first: completed.depth}
+    for name in READ_OUTS_OF[spec.output]:
+        if name in found:
+            continue
+        if completed.foreground is not None and completed.background is not None and completed.sigma is not None:
+            found[name] = fuse(completed.foreground, completed.background, completed.sigma, name)
+        else:
+            found[name] = _other(completer, name)(frame).depth
+    return found
+
+
+def _other(completer: NetworkCompleter, read_out: str) -> Callable[[DepthFrame], CompletedDepth]:
+    from completion.infer import NetworkCompleter
+
+    other = NetworkCompleter(completer.model, completer.spec, read_out=read_out)
+    return lambda frame: other.complete(frame.sparse, frame.image)
+
+
+def score(completer: NetworkCompleter, frames: Sequence[StoredFrame], spec: ModelSpec, diagnosed: int) -> Outcome:
+    """Means over test frames.
+
+    Names: "mae_mm" and so on for the default read-out against clean truth; "READ_OUT/mae_mm"; "semi_dense/mae_mm"
+    against pseudo ground truth; "whole/", "edge/", "inside/" by region (Table 4.2); and, over the first `diagnosed`
+    frames, what `completion.diagnostics.diagnose` finds: "alive/grey_mae_mm", "alive/sigma_spread", ...
+    """
+    from completion.analysis import region_metrics
+    from completion.diagnostics import diagnose
+    from completion.types import DepthFrame
+
+    columns: dict[str, list[float]] = {}
+
+    def add(view: str, scores: dict[str, float], number: int) -> None:
+        for name, value in scores.items():
+            key = f"{view}/{name}" if view else name
+            values = columns.setdefault(key, [])
+            values.extend([float("nan")] * (number - len(values)))
+            values.append(value)
+
+    for number, frame in enumerate(frames):
+        found = read_outs(completer, spec, DepthFrame(frame.image, frame.sparse[64]))
+        for index, (name, depth) in enumerate(found.items()):
+            scores = frame_scores(depth, frame.clean)
+            add(name, scores, number)
+            if index == 0:
+                add("", scores, number)
+                if frame.semi_dense is not None and frame.semi_dense.any():
+                    add("semi_dense", frame_scores(depth, frame.semi_dense), number)
+                if frame.foreground is not None:
+                    for region, scores in region_metrics(depth, frame.clean, frame.foreground).items():
+                        add(region, scores, number)
+    numbers = {name: _mean(values) for name, values in columns.items()}
+    some = [DepthFrame(frame.image, frame.sparse[64], frame.clean) for frame in frames[:diagnosed]]
+    numbers |= {f"alive/{name}": value for name, value in diagnose(completer, some).items()}
+    kept = {name: values for name, values in columns.items() if name.rpartition("/")[2] in PER_FRAME}
+    return Outcome(numbers, {name: _padded(values, len(frames)) for name, values in kept.items()})
+
+
+def _mean(values: Sequence[float]) -> float:
+    numbers = np.asarray(values, np.float64)
+    finite = numbers[np.isfinite(numbers)]
+    return float(finite.mean()) if len(finite) else float("nan")
+
+
+def _padded(values: list[float], count: int) -> list[float]:
+    return values + [float("nan")] * (count - len(values))
