@@ -107,9 +107,8 @@ def fence(rng: np.random.Generator, length: float, near: bool) -> list[Part]:
     return [*parts, boxes(where, (width * (1 if near else 1.6), 0.02, height - 0.1), surface)]
 
 
-def wall(rng: np.random.Generator, length: float) -> list[Part]:
+def wall(rng: np.random.Generator, length: float, height: float) -> list[Part]:
     """A garden wall along x with a coping."""
-    height = float(rng.uniform(0.5, 2.0))
     brick = Surface(
         Texture.BRICK, S.vary(rng, (0.24, 0.11, 0.07), 0.3), S.WALL, 0.35, second=(0.3, 0.28, 0.25), scale=0.25
     )

@@ -57,6 +57,13 @@ def extent(parts: Iterable[Part]) -> tuple[NDArray[np.float64], NDArray[np.float
     return np.min(lows, axis=0), np.max(highs, axis=0)
 
 
+def joined(parts: Sequence[Part]) -> Part:
+    """Parts of one material as one part."""
+    offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=True)]
+    return Part(np.concatenate([part.vertices for part in parts]), np.concatenate(faces), parts[0].surface)
+
+
 def fitted(parts: list[Part], length: float, width: float, height: float) -> list[Part]:
     """The parts stretched and shifted so that together they fill exactly this box, standing on z = 0."""
     low, high = extent(parts)

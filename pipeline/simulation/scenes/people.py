@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulation.scenes import surfaces as S
-from pipeline.simulation.scenes.mesh import Part, box, ellipsoid, fitted, tube
+from pipeline.simulation.scenes.mesh import Part, box, ellipsoid, fitted, joined, tube
 from pipeline.simulation.scenes.surfaces import Surface, Texture
 from pipeline.simulation.scenes.vehicles import Model
 
@@ -71,25 +71,43 @@ def _wheel(x: float, radius: float, surface: Surface) -> Part:
     return tube(rim, np.full(15, 0.022), 5, surface)
 
 
-def build_cyclist(rng: np.random.Generator) -> Model:
-    """A rider on a bicycle; one labelled thing, two classes."""
-    coat, trousers, skin = _cloth(rng, S.RIDER), _cloth(rng, S.RIDER), _skin(rng, S.RIDER)
-    frame = Surface(Texture.PLAIN, S.vary(rng, _CLOTHES[rng.integers(len(_CLOTHES))], 0.3), S.BICYCLE, 0.3, gloss=0.2)
+def _frame_paint(rng: np.random.Generator) -> Surface:
+    return Surface(Texture.PLAIN, S.vary(rng, _CLOTHES[rng.integers(len(_CLOTHES))], 0.3), S.BICYCLE, 0.3, gloss=0.2)
+
+
+def _bicycle(frame: Surface) -> list[Part]:
+    """Wheels, frame, handlebar and saddle of a bicycle along x, 1.7 m long."""
     tyre = S.TYRE.classed(S.BICYCLE)
-    lean = float(rng.uniform(0.05, 0.35))
-    shoulder, head = (lean - 0.15, 1.36), (lean - 0.06, 1.63)
-    parts = [_wheel(-0.52, 0.34, tyre), _wheel(0.52, 0.34, tyre)]
-    for start, end in (
+    wheels = [_wheel(-0.52, 0.34, tyre), _wheel(0.52, 0.34, tyre)]
+    tubes = (
         ((-0.52, 0.34), (-0.2, 0.85)),
         ((-0.52, 0.34), (0.0, 0.3)),
         ((0.0, 0.3), (-0.2, 0.85)),
         ((0.0, 0.3), (0.42, 0.88)),
         ((-0.2, 0.82), (0.42, 0.86)),
         ((0.42, 0.98), (0.52, 0.34)),
-    ):
-        parts.append(_limb([(start[0], 0, start[1]), (end[0], 0, end[1])], [0.024, 0.024], frame))
-    parts.append(_limb([(0.40, -0.27, 0.99), (0.44, 0, 1.0), (0.40, 0.27, 0.99)], [0.016, 0.016, 0.016], frame))
-    parts.append(box(0.26, 0.15, 0.06, S.PLASTIC_DARK.classed(S.BICYCLE), 0.9).at(-0.22, 0))
+    )
+    bars = [_limb([(start[0], 0, start[1]), (end[0], 0, end[1])], [0.024, 0.024], frame) for start, end in tubes]
+    bars.append(_limb([(0.40, -0.27, 0.99), (0.44, 0, 1.0), (0.40, 0.27, 0.99)], [0.016, 0.016, 0.016], frame))
+    saddle = box(0.26, 0.15, 0.06, S.PLASTIC_DARK.classed(S.BICYCLE), 0.9).at(-0.22, 0)
+    return [joined(wheels), joined(bars), saddle]
+
+
+def bicycle(rng: np.random.Generator) -> list[Part]:
+    """A parked bicycle along x, some with a basket."""
+    parts = _bicycle(_frame_paint(rng))
+    if rng.random() < 0.25:
+        parts.append(box(0.3, 0.34, 0.24, S.PLASTIC_DARK.classed(S.BICYCLE), 0.78).at(0.62, 0))
+    return parts
+
+
+def build_cyclist(rng: np.random.Generator) -> Model:
+    """A rider on a bicycle; one labelled thing, two classes."""
+    coat, trousers, skin = _cloth(rng, S.RIDER), _cloth(rng, S.RIDER), _skin(rng, S.RIDER)
+    frame = _frame_paint(rng)
+    lean = float(rng.uniform(0.05, 0.35))
+    shoulder, head = (lean - 0.15, 1.36), (lean - 0.06, 1.63)
+    parts = _bicycle(frame)
     parts.append(
         _limb(
             [(-0.2, 0, 0.95), ((shoulder[0] - 0.2) / 2, 0, 1.17), (shoulder[0], 0, shoulder[1])],

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.simulation.scenes import furniture, vegetation
+from pipeline.simulation.scenes.confusers import build_confuser
 from pipeline.simulation.scenes.ground import Ground
 from pipeline.simulation.scenes.mesh import Part
 from pipeline.simulation.scenes.people import build_cyclist, build_pedestrian
@@ -36,6 +37,11 @@ class Site:
         self.taken.append(wanted)
         return True
 
+    def _claim_turned(self, s: float, d: float, yaw: float, length: float, width: float) -> bool:
+        """Takes the rectangle round a footprint of this length and width turned by `yaw`."""
+        cos, sin = abs(np.cos(yaw)), abs(np.sin(yaw))
+        return self.claim(s, d, length * cos + width * sin, length * sin + width * cos)
+
     def _between(self, one: float, other: float) -> float:
         """A uniform draw between two bounds in either order (the two sides of a road are mirror images)."""
         return float(self.rng.uniform(min(one, other), max(one, other)))
@@ -56,9 +62,7 @@ class Site:
 
     def add(self, model: Model, s: float, d: float, yaw: float, speed: float = 0.0) -> bool:
         """A labelled thing if its place is free."""
-        length, width, _ = model.size
-        cos, sin = abs(np.cos(yaw)), abs(np.sin(yaw))
-        if not self.claim(s, d, length * cos + width * sin, length * sin + width * cos):
+        if not self._claim_turned(s, d, yaw, model.size[0], model.size[1]):
             return False
         self.objects.append(Placed(model, s, d, yaw, speed))
         return True
@@ -160,7 +164,7 @@ class Site:
                 elif kind < 0.60:
                     self.put(furniture.fence(self.rng, length, near), middle, d)
                 elif kind < 0.82:
-                    self.put(furniture.wall(self.rng, length), middle, d)
+                    self.put(furniture.wall(self.rng, length, float(self.rng.uniform(0.5, 2.0))), middle, d)
             s += length + (float(self.rng.uniform(0, 4)) if self.rng.random() < 0.6 else 0.0)
 
     def furniture_row(self, d: float, count: int, towards_road: float) -> None:
@@ -183,21 +187,29 @@ class Site:
                 )
                 self.put(maker(self.rng), s, d + float(self.rng.normal(0, 0.08)), yaw)
 
-    def confusers(self, low_d: float, high_d: float, count: int, start: float = -25, stop: float = 60) -> None:
-        """What a detector takes for a car: skips, phone boxes, heaps, kiosks, car-sized bushes, trailers."""
+    def confusers(self, low_d: float, high_d: float, count: int, start: float = -8, stop: float = 60) -> None:
+        """What a detector takes for a car, see `scenes.confusers`; and trailers, which KITTI labels Misc."""
         for _ in range(count):
             s, d = float(self.rng.uniform(start, stop)), self._between(low_d, high_d)
             yaw = float(self.rng.normal(0, 0.15)) + (np.pi / 2 if self.rng.random() < 0.25 else 0.0)
-            kind = self.rng.random()
-            if kind < 0.12:
+            if self.rng.random() < 0.06:
                 self.add(furniture.trailer(self.rng), s, d, yaw)
-            elif not self.claim(s, d, 4.4, 2.2):
                 continue
-            elif kind < 0.35:
-                self.put(furniture.skip(self.rng), s, d, yaw)
-            elif kind < 0.5:
-                self.put(furniture.phone_box(self.rng), s, d, yaw)
-            elif kind < 0.78:
-                self.put(furniture.clutter(self.rng), s, d, yaw)
-            else:
-                self.put(vegetation.build_bush(self.rng, self.detail(s, d), 4.0, 1.8, 1.5), s, d, yaw)
+            parts, (length, width) = build_confuser(self.rng, self.detail(s, d))
+            cos, sin = abs(np.cos(yaw)), abs(np.sin(yaw))
+            if not self.on_crossing(s, 1.0) and self.claim(
+                s, d, length * cos + width * sin, length * sin + width * cos
+            ):
+                self.put(parts, s, d, yaw)
+
+    def thicket(self, d: float, start: float, stop: float, height: tuple[float, float]) -> None:
+        """Undergrowth or the edge of a wood along the road at distance d, in pieces of varying height."""
+        s = start
+        while s < stop:
+            length, width = float(self.rng.uniform(7, 14)), float(self.rng.uniform(2, 4.5))
+            tall = float(self.rng.uniform(*height))
+            middle = s + length / 2
+            if not self.on_crossing(middle, length / 2) and self.claim(middle, d, length, width, 0.0):
+                parts = vegetation.build_thicket(self.rng, self.detail(middle, d), length + 1.0, width, tall)
+                self.put(parts, middle, d + float(self.rng.normal(0, 0.5)))
+            s += length + (float(self.rng.uniform(0, 9)) if self.rng.random() < 0.2 else 0.0)

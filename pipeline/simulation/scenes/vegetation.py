@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulation.scenes import surfaces as S
-from pipeline.simulation.scenes.mesh import Part, box, cards, cylinder, ellipsoid, tube
+from pipeline.simulation.scenes.mesh import Part, box, cards, cylinder, ellipsoid, grid_faces, tube
 from pipeline.simulation.scenes.surfaces import Surface, Texture
 
 _GREENS: tuple[S.Colour, ...] = (
@@ -123,6 +123,25 @@ def build_hedge(rng: np.random.Generator, detail: float, length: float, width: f
     centres[~side, 2] = height * rng.uniform(0.92, 1.04, int((~side).sum()))
     sizes = 0.12 / np.sqrt(max(detail, 0.08)) * rng.uniform(0.6, 1.4, count)
     return [box(length, 0.86 * width, 0.94 * height, _core(leaves)), cards(centres, sizes, rng, leaves)]
+
+
+def build_thicket(rng: np.random.Generator, detail: float, length: float, width: float, height: float) -> list[Part]:
+    """Undergrowth and the edge of a wood along x: a bumpy dark bank under leaves, closed down to the ground."""
+    leaves = foliage(rng)
+    along, around = max(3, int(length / 1.6) + 1), 7
+    x = np.linspace(-length / 2, length / 2, along)[:, None]
+    angle = np.linspace(0, np.pi, around)[None]
+    crest = rng.uniform(0.65, 1.0, (along, 1))
+    bump = crest * rng.uniform(0.85, 1.1, (along, around))
+    y, z = 0.5 * width * np.cos(angle) * bump**0.5, height * np.sin(angle) ** 0.7 * bump - 0.2
+    vertices = np.stack([np.broadcast_to(x, y.shape), y, z], axis=-1)
+    bank = Part(vertices.reshape(-1, 3), grid_faces(along, around), _core(leaves))
+    count = int(length * height * (14 * detail + 1.5))
+    row, column = rng.integers(0, along, count), rng.integers(0, around, count)
+    centres = vertices[row, column] * np.array([1, 1.02, 1.02]) + rng.normal(0, (0.6, 0.25, 0.3), (count, 3))
+    centres[:, 2] = np.maximum(centres[:, 2], 0.05)
+    sizes = 0.2 / np.sqrt(max(detail, 0.08)) * rng.uniform(0.6, 1.4, count)
+    return [bank, cards(centres, sizes, rng, leaves)]
 
 
 def build_grass(rng: np.random.Generator, length: float, width: float) -> list[Part]:

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from pipeline.simulation.scenes import surfaces as S
+from pipeline.simulation.scenes.confusers import CONFUSERS, Builder, build_confuser
 from pipeline.simulation.scenes.furniture import bins, clutter, fence, phone_box, skip, traffic_light, trailer, wall
 from pipeline.simulation.scenes.ground import Road
 from pipeline.simulation.scenes.layouts import LAYOUTS, draw_scene
 from pipeline.simulation.scenes.mesh import assemble, box, cylinder, ellipsoid, extent, fitted, pose
 from pipeline.simulation.scenes.people import build_cyclist, build_pedestrian
-from pipeline.simulation.scenes.vegetation import build_bush, build_hedge, build_tree
+from pipeline.simulation.scenes.vegetation import build_bush, build_hedge, build_thicket, build_tree
 from pipeline.simulation.scenes.vehicles import BODIES, build_truck, build_vehicle, draw_vehicle
 
 Rng = np.random.Generator
@@ -92,8 +93,36 @@ def test_clutter_stands_on_the_ground_and_confusers_are_of_car_size(rng: Rng) ->
     assert 2.5 < (high - low)[0] < 5
     low, high = extent(build_bush(rng, 1.0, 4.0, 1.8, 1.5))
     assert 1.0 < (high - low)[2] < 2.5
-    for part in [*fence(rng, 8.0, True), *wall(rng, 8.0), *build_hedge(rng, 1.0, 8.0, 0.8, 1.4)]:
+    for part in [*fence(rng, 8.0, True), *wall(rng, 8.0, 1.2), *build_hedge(rng, 1.0, 8.0, 0.8, 1.4)]:
         assert np.isfinite(part.vertices).all()
+
+
+@pytest.mark.parametrize("build", [build for build, _ in CONFUSERS])
+def test_confusers_stand_on_the_ground_in_the_size_of_what_they_are_taken_for(build: Builder, rng: Rng) -> None:
+    for detail in (1.0, 0.1):
+        parts = build(rng, detail)
+        low, high = extent(parts)
+        size = high - low
+        assert -0.3 < low[2] < 0.45
+        assert 0.4 < size[2] < 2.9
+        assert 0.5 < max(size[:2]) < 9.5
+        # A detector must not be told of them by the class map: none is a car, and none has an instance.
+        assert all(part.surface.train_id != S.CAR for part in parts)
+
+
+def test_confuser_is_centred_on_its_footprint(rng: Rng) -> None:
+    for _ in range(20):
+        parts, (length, width) = build_confuser(rng, 0.3)
+        low, high = extent(parts)
+        np.testing.assert_allclose((high - low)[:2], (length, width))
+        np.testing.assert_allclose((high + low)[:2], 0, atol=1e-9)
+
+
+def test_thickets_close_the_view_down_to_the_ground(rng: Rng) -> None:
+    low, high = extent(build_thicket(rng, 0.2, 10.0, 3.0, 4.0))
+    assert low[2] < 0
+    assert 2.4 < high[2] < 5.5
+    assert (high - low)[0] > 9.9
 
 
 def test_far_trees_have_fewer_leaves() -> None:
