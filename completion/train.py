@@ -20,8 +20,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from completion.checkpoints import Card, save_checkpoint
+from completion.checkpoints import Card, load_checkpoint, save_checkpoint
 from completion.diagnostics import diagnose
+from completion.growth import grow
 from completion.infer import NetworkCompleter
 from completion.inputs import scale_rgb
 from completion.models import ModelSpec, build_model
@@ -51,6 +52,7 @@ class TrainSettings:
     scale_weights    (from epoch, weights of the outputs, finest first), ascending
     precision        "fp32", or "bf16" / "fp16" autocast on a GPU
     read_out         how validation reads one depth from the output; "" for the usual one
+    warm_start       weights (a path or an embedded name) to begin with, of the same network or a narrower one
     validate_every   steps between validations; 0: only at the end
     best_by          the validation figure that chooses the best checkpoint, lower is better
     log_every        steps between rows of log.csv
@@ -77,6 +79,7 @@ class TrainSettings:
     scale_weights: tuple[tuple[float, tuple[float, ...]], ...] = ((0, (1, 1, 1)), (10, (1, 0.1, 0.1)), (20, (1, 0, 0)))
     precision: str = "fp32"
     read_out: str = ""
+    warm_start: str | None = None
     validate_every: int = 0
     validation_frames: int = 8
     best_by: str = "mae_mm"
@@ -106,6 +109,8 @@ class TrainSettings:
             del what[free]
         for free in ("checkpoint_seconds", "workers", "best_by", "read_out"):
             del what[free]
+        if self.warm_start is None:
+            del what["warm_start"]
         return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
 
@@ -208,6 +213,8 @@ class _Run:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
             model = build_model(settings.model)
+        if settings.warm_start is not None:
+            grow(load_checkpoint(settings.warm_start)[0], model)
         self.model = model.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.optimiser = torch.optim.Adam(
             self.model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay

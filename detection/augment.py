@@ -21,15 +21,21 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SceneAugmentation:
-    """Scene augmentation of PointRCNN (probabilities 1, 1, 0.5).
+    """Scene augmentation of PointRCNN (probabilities 1, 1, 0.5), and what helps from synthetic to real scans.
 
     rotation  largest angle about the vertical axis, radians       scale  largest relative change of size
     flip      probability of mirroring left and right
+    object_scale  largest relative change of each object's height, width and length with its points (0: none), against
+                  learning the sizes of the training set by heart (ST3D, Yang et al. 2021: random object scaling)
+    noise     standard deviation of every coordinate, metres        drop  largest share of points left out
     """
 
     rotation: float = math.pi / 18
     scale: float = 0.05
     flip: float = 0.5
+    object_scale: float = 0.0
+    noise: float = 0.0
+    drop: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,10 @@ def flip_boxes(boxes: Array) -> Array:
 
 def augment_scene(scene: TrainingScene, settings: SceneAugmentation, rng: np.random.Generator) -> TrainingScene:
     """The scene rotated, scaled and perhaps mirrored; heights above ground scale with it."""
+    if settings.object_scale:
+        scene = scale_objects(scene, settings.object_scale, rng)
+    if settings.noise or settings.drop:
+        scene = disturb_points(scene, settings.noise, settings.drop, rng)
     angle = rng.uniform(-settings.rotation, settings.rotation)
     scale = rng.uniform(1 - settings.scale, 1 + settings.scale)
     flip = rng.uniform() < settings.flip
@@ -83,6 +93,27 @@ def augment_scene(scene: TrainingScene, settings: SceneAugmentation, rng: np.ran
     return TrainingScene(
         points, scene.height * np.float32(scale), moved(scene.boxes), scene.classes, moved(scene.obstacles)
     )
+
+
+def scale_objects(scene: TrainingScene, largest: float, rng: np.random.Generator) -> TrainingScene:
+    """Every labelled object with its points stretched along height, width and length about its bottom centre."""
+    points, height, boxes = scene.points.copy(), scene.height.copy(), scene.boxes.copy()
+    for box in boxes:
+        h, w, l = factors = rng.uniform(1 - largest, 1 + largest, 3)
+        inside = np.flatnonzero(inside_box(scene.points, box))
+        local = rotate_about_y(points[inside, :3] - box[:3], -box[6]) * np.array([l, h, w])
+        points[inside, :3] = rotate_about_y(local, box[6]) + box[:3]
+        height[inside] *= np.float32(h)
+        box[3:6] *= factors
+    return TrainingScene(points, height, boxes, scene.classes, scene.obstacles)
+
+
+def disturb_points(scene: TrainingScene, noise: float, drop: float, rng: np.random.Generator) -> TrainingScene:
+    """Gaussian noise on coordinates, and a random share of up to `drop` of the points left out."""
+    kept = rng.random(len(scene.points)) >= rng.uniform(0, drop)
+    points = scene.points[kept].copy()
+    points[:, :3] += rng.normal(0, noise, (len(points), 3)).astype(np.float32)
+    return TrainingScene(points, scene.height[kept], scene.boxes, scene.classes, scene.obstacles)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 # PointRCNN's PC_AREA_SCOPE: x right, y down, z forward in metres, borders included.
 AREA = ((-40.0, 40.0), (-1.0, 3.0), (0.0, 70.4))
 
-# Classes that count as another in training (INCLUDE_SIMILAR_TYPE).
+# Classes that count as another in training (INCLUDE_SIMILAR_TYPE), unless a detector has them as its own.
 SIMILAR = {"Van": "Car", "Person_sitting": "Pedestrian"}
 
 FEATURES = ("height", "range", "intensity", "source", "semantic")
@@ -117,13 +117,15 @@ class TruthBoxes:
 
 
 def truth_boxes(objects: Iterable[KittiObject], classes: Sequence[str]) -> TruthBoxes:
-    """Training boxes: objects of the classes whose bottom centre is in `AREA`; Van counts as Car, see `SIMILAR`.
+    """Training boxes: objects of the classes whose bottom centre is in `AREA`.
+
+    A class the detector lacks may count as another: Van as Car, see `SIMILAR`.
 
     No difficulty filter: occluded, truncated and tiny objects are positives, as in PointRCNN.
     """
     rows, labels = [], []
     for item in objects:
-        name = SIMILAR.get(item.type, item.type)
+        name = item.type if item.type in classes else SIMILAR.get(item.type, item.type)
         in_area = all(low <= value <= high for value, (low, high) in zip(item.location, AREA))
         if name in classes and in_area and min(item.size) > 0:
             rows.append((*item.location, *item.size, item.ry))

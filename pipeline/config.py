@@ -98,7 +98,8 @@ class TrainConfig(LibrarySection):
     """Training; other keys: the `TrainSettings` of the network's library."""
 
     network: Literal["completion", "detection", "segmentation"] = "completion"
-    # Completion only: every n-th LiDAR ring with n drawn from these, e.g. [1, 2, 4, 8]; none: the frame's sparse map.
+    # Every n-th LiDAR ring, e.g. [1, 2, 4, 8]. Completion draws n for every crop; detection sees every frame once with
+    # each n. None: the frame's sparse map, the run's clouds.
     row_steps: tuple[int, ...] = ()
     # With row_steps: standard deviation in degrees of a random rotation between LiDAR and camera.
     calibration_jitter: float = 0.0

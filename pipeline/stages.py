@@ -280,7 +280,8 @@ def frame_stages_for(stage: str, config: Config, has_points: bool = True) -> lis
 
     has_points  False for data sets without LiDAR (NYU, depth maps only): their depth is completed and nothing more
     """
-    last = {"synth": None, "train": "augment" if config.train.network == "detection" else None}.get(stage, "detect")
+    trains_on_clouds = config.train.network == "detection" and not config.train.row_steps
+    last = {"synth": None, "train": "augment" if trains_on_clouds else None}.get(stage, "detect")
     if stage in FRAME_STAGES:
         last = stage
     if last is None:

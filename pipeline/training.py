@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from completion.samples import TrainingSample
     from completion.types import DepthFrame
     from detection.kitti_format import KittiObject
+    from detection.train import LabelledFrames
     from detection.types import PointFrame
 
 
@@ -92,6 +93,15 @@ class SegmentationSettings:
     seed: int = 0
 
 
+def cloud_samples(dataset: Dataset, config: Config, run: RunFolder) -> LabelledFrames:
+    """The run's clouds, or with `train.row_steps` clouds of so many rows made for training alone."""
+    if not config.train.row_steps:
+        return CloudSamples(dataset, config, run)
+    from pipeline.training_clouds import ThinnedClouds
+
+    return ThinnedClouds(dataset, config, run)
+
+
 def train_stage(config: Config, run: RunFolder) -> Path:
     """Trains, or continues to train, the network of the configuration; returns its weights."""
     dataset = open_frames(config, run)
@@ -102,7 +112,9 @@ def train_stage(config: Config, run: RunFolder) -> Path:
             return train_completion(config, dataset, out)
         if config.train.network == "segmentation":
             return train_segmentation(config, dataset, out)
-        return train_detection(config, CloudSamples(dataset, config, run), out)
+        if not dataset[0].has("labels"):
+            raise UsageError(f"{dataset.root}: frame {dataset.ids[0]} has no label to train detection on")
+        return train_detection(config, cloud_samples(dataset, config, run), out)
     except DataError:
         raise
     except ValueError as error:
@@ -138,12 +150,10 @@ def _validation_frame(frame: Frame, config: Config) -> DepthFrame:
     return DepthFrame(frame.image, sparse, frame.target_depth)
 
 
-def train_detection(config: Config, samples: CloudSamples, out: Path) -> Path:
+def train_detection(config: Config, samples: LabelledFrames, out: Path) -> Path:
     """`detection.train` on labelled clouds."""
     from detection.train import TrainSettings, train
 
-    if not samples.dataset[0].has("labels"):
-        raise UsageError(f"{samples.dataset.root}: frame {samples.dataset.ids[0]} has no label to train detection on")
     settings = with_changes(TrainSettings(seed=config.seed), config.train.library, "train")
 
     def report(progress: Any) -> None:

@@ -18,6 +18,7 @@ MEAN_SIZES: dict[str, tuple[float, float, float]] = {
     "Car": (1.52563191462, 1.62856739989, 3.88311640418),
     "Pedestrian": (1.76, 0.66, 0.84),
     "Cyclist": (1.74, 0.60, 1.76),
+    "Van": (2.21, 1.90, 5.08),
 }
 
 

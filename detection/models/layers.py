@@ -15,6 +15,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from detection.ops.norm import can_fuse, norm_relu, norm_relu_maximum
+
 
 class PointwiseWeight(nn.Module):
     """The parameters of a 1x1 convolution: weight (out, in, 1[, 1]) and perhaps bias (out,)."""
@@ -59,6 +61,32 @@ class RowBatchNorm(nn.BatchNorm1d):
         )
         return normalised.permute(0, 2, 3, 1).reshape(rows.shape)
 
+    def relu(self, rows: Tensor) -> Tensor:
+        """relu(self(rows)), (..., C) -> (..., C); in one operation when training on a CPU."""
+        if not (self.training and can_fuse(rows)):
+            return F.relu(self(rows), inplace=True)
+        out, moments = norm_relu(rows, self.weight, self.bias, self.eps)
+        self._track(moments, rows.numel() // rows.shape[-1])
+        return out
+
+    def relu_maximum(self, rows: Tensor) -> Tensor:
+        """relu(self(rows)) and its maximum over the neighbours, (R, K, C) -> (R, C)."""
+        if not (self.training and can_fuse(rows)):
+            # max(relu(x)) = relu(max(x)); the maximum first saves a pass over all neighbours.
+            return F.relu(maximum(self(rows)), inplace=True)
+        out, moments = norm_relu_maximum(rows, self.weight, self.bias, self.eps)
+        self._track(moments, rows.numel() // rows.shape[-1])
+        return out
+
+    @torch.no_grad()
+    def _track(self, moments: tuple[Tensor, Tensor], count: int) -> None:
+        """Moves the running statistics as `F.batch_norm` does, with the unbiased variance of `count` rows."""
+        mean, variance = moments
+        momentum = cast(float, self.momentum)
+        cast(Tensor, self.num_batches_tracked).add_(1)
+        cast(Tensor, self.running_mean).lerp_(mean, momentum)
+        cast(Tensor, self.running_var).lerp_(variance * (count / (count - 1)), momentum)
+
     def as_affine(self) -> tuple[Tensor, Tensor]:
         """(scale, shift), each (C,), of the normalisation with the running statistics."""
         scale = self.weight * torch.rsqrt(cast(Tensor, self.running_var) + self.eps)
@@ -86,6 +114,33 @@ def project(conv: PointwiseWeight, norm: nn.Module | None, rows: Tensor) -> Tens
     return F.linear(rows, conv.matrix * scale[:, None], shift)
 
 
+def begin(conv: PointwiseWeight, norm: nn.Module | None, rows: Tensor) -> tuple[Tensor, nn.Module | None]:
+    """The convolution, and the normalisation that is still to follow: none when its statistics are fixed."""
+    if norm is not None and norm.training:
+        return conv(rows), norm
+    return project(conv, norm, rows), None
+
+
+def project_relu(conv: PointwiseWeight, norm: nn.Module | None, rows: Tensor) -> Tensor:
+    """`project` and ReLU."""
+    if norm is None or not norm.training:
+        return F.relu(project(conv, norm, rows), inplace=True)
+    return _batch_norm(norm).relu(conv(rows))
+
+
+def normalise_relu(norm: nn.Module | None, rows: Tensor) -> Tensor:
+    """Normalisation (or none) and ReLU."""
+    return F.relu(rows, inplace=True) if norm is None else _batch_norm(norm).relu(rows)
+
+
+def normalise_relu_maximum(norm: nn.Module | None, rows: Tensor) -> Tensor:
+    """Normalisation (or none) and ReLU of groups (R, K, C), and their maximum (R, C)."""
+    if norm is None:
+        # max(relu(x)) = relu(max(x)); the maximum first saves a pass over all neighbours.
+        return F.relu(maximum(rows), inplace=True)
+    return _batch_norm(norm).relu_maximum(rows)
+
+
 def _batch_norm(norm: nn.Module) -> RowBatchNorm:
     return cast(RowBatchNorm, norm.bn if isinstance(norm, NamedBatchNorm) else norm)
 
@@ -106,8 +161,7 @@ class PointLayer(nn.Module):
 
     def forward(self, rows: Tensor) -> Tensor:
         """(..., in) -> (..., out)."""
-        projected = project(self.conv, self.bn, rows)
-        return F.relu(projected, inplace=True) if self.activation else projected
+        return project_relu(self.conv, self.bn, rows) if self.activation else project(self.conv, self.bn, rows)
 
 
 _CACHED_ROWS = 4096
@@ -125,7 +179,7 @@ class PointMLP(nn.Sequential):
     def forward(self, rows: Tensor) -> Tensor:
         """(..., in) -> (..., out)."""
         for conv, norm in self.stages():
-            rows = F.relu(project(conv, norm, rows), inplace=True)
+            rows = project_relu(conv, norm, rows)
         return rows
 
     def group_maximum(self, source: Tensor | None, offset: Tensor, gather: Tensor) -> Tensor:
@@ -149,15 +203,13 @@ class PointMLP(nn.Sequential):
         """`group_maximum` with the product of the source features already taken."""
         (conv, norm), *others = self.stages()
         if shared is None:
-            rows = project(conv, norm, offset)
+            rows, norm = begin(conv, norm, offset)
         else:
             rows = shared.index_select(0, gather.reshape(-1)).view(*gather.shape, -1)
             rows = rows + F.linear(offset, conv.matrix[:, :3], conv.bias)
-            rows = rows if norm is None else norm(rows)
-        for conv, norm in others:
-            rows = project(conv, norm, F.relu(rows, inplace=True))
-        # max(relu(x)) = relu(max(x)); the maximum first saves a pass over all neighbours.
-        return F.relu(maximum(rows), inplace=True)
+        for conv, following in others:
+            rows, norm = begin(conv, following, normalise_relu(norm, rows))
+        return normalise_relu_maximum(norm, rows)
 
 
 def maximum(rows: Tensor) -> Tensor:

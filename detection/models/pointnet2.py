@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from detection.models.layers import IndexedMLP, PointMLP, SharedMLP, maximum, project
+from detection.models.layers import IndexedMLP, PointMLP, SharedMLP, maximum, normalise_relu, project_relu
 from detection.ops import ball_query, furthest_point_sample, interpolation_weights, three_nn
 
 # How a checkpoint names the layers of a point network.
@@ -129,9 +129,9 @@ class FeaturePropagation(nn.Module):
         rows = interpolate_rows(unknown, known, F.linear(features, weight[:, :channels]))
         if skip is not None:
             rows = rows + F.linear(skip, weight[:, channels:])
-        rows = F.relu(cast(nn.Module, norm)(rows), inplace=True)
+        rows = normalise_relu(norm, rows)
         for conv, norm in others:
-            rows = F.relu(project(conv, norm, rows), inplace=True)
+            rows = project_relu(conv, norm, rows)
         return rows
 
 

@@ -22,21 +22,27 @@ _NEAR_FAR_TRAIN = ProposalSettings(before=9000, after=512, iou=0.85, by_distance
 _NEAR_FAR_TEST = ProposalSettings(before=9000, after=100, iou=0.8, by_distance=True, rotated=False)
 
 
-def small(features: tuple[str, ...] = ("height", "range"), points: int = 8192, width: float = 1.0) -> Preset:
+def small(
+    features: tuple[str, ...] = ("height", "range"),
+    points: int = 8192,
+    width: float = 1.0,
+    classes: tuple[str, ...] = CLASSES,
+) -> Preset:
     """The CPU detector for Car, Pedestrian and Cyclist that this project trains and ships.
 
     features  point columns; add "source" (and "semantic") for augmented clouds
     width     factor on all layer widths of the first stage
+    classes   with "Van" among them vans are told apart from cars instead of counting as such
     """
-    features = tuple(features)
-    settings = CompactSettings(features=features).widened(width)
+    features, classes = tuple(features), tuple(classes)
+    settings = CompactSettings(classes=classes, features=features).widened(width)
     return Preset(
         name="small",
-        classes=CLASSES,
+        classes=classes,
         inputs=InputSettings(points, "balanced", features, cloud=60000),
         outputs=OutputSettings(0.1, 0.1, probability=True, mirrored_pass=True, vote_iou=0.5),
         build=lambda: CompactPointRCNN(settings),
-        options={"features": list(features), "points": points, "width": width},
+        options={"features": list(features), "points": points, "width": width, "classes": list(classes)},
         skip_empty_frames=False,
     )
 

@@ -13,10 +13,12 @@ from detection.augment import (
     augment_regions,
     augment_scene,
     cut_objects,
+    disturb_points,
     flip_boxes,
     inside_box,
     paste_objects,
     rotate_about_y,
+    scale_objects,
 )
 from detection.inputs import camera_cloud, ground_height, truth_boxes
 from detection.models.box_coding import to_roi_frame
@@ -102,3 +104,27 @@ def test_roi_augmentation_keeps_what_the_network_sees_but_for_scale_and_mirror(r
         torch.testing.assert_close(new[:3], old[:3] * scale * sign)
         assert torch.cos(new[6] - (-old[6] if flipped else old[6])).item() == pytest.approx(1.0)
     assert 3 <= flips <= 17
+
+
+def test_scaled_object_by_hand() -> None:
+    """A point near a corner of the roof stays there, points outside stay where they are."""
+    box = np.array([10.0, 2, 20, 1.5, 1.6, 4, np.pi / 2])  # l along -z
+    corner = [10 + 0.9 * 0.8, 2 - 0.9 * 1.5, 20 - 0.9 * 2.0]
+    points = np.array([corner, [0, 2, 20]], dtype=np.float32)
+    before = TrainingScene(points, np.array([1.35, 0], np.float32), box[None], np.array([1]), box[None])
+    after = scale_objects(before, 0.2, np.random.default_rng(2))
+    h, w, l = after.boxes[0, 3:6]
+    assert min(abs(h / 1.5 - 1), abs(w / 1.6 - 1), abs(l / 4 - 1)) > 0.05
+    np.testing.assert_allclose(after.points[0], [10 + 0.9 * w / 2, 2 - 0.9 * h, 20 - 0.9 * l / 2], atol=1e-5)
+    np.testing.assert_allclose(after.points[1], points[1])
+    np.testing.assert_allclose(after.height, [0.9 * h, 0], atol=1e-5)
+    np.testing.assert_array_equal(before.points, points)
+
+
+def test_disturbed_points_are_fewer_and_near(rng) -> None:
+    before = scene(1)
+    after = disturb_points(before, 0.0, 0.5, rng)
+    assert len(before.points) * 0.45 < len(after.points) < len(before.points)
+    noisy = disturb_points(before, 0.02, 0.0, rng)
+    assert np.std(noisy.points[:, :3] - before.points[:, :3]) == pytest.approx(0.02, rel=0.05)
+    assert len(after.height) == len(after.points)
