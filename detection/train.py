@@ -36,6 +36,7 @@ from detection.checkpoints import load_checkpoint, load_tensors, save_checkpoint
 from detection.inputs import CameraCloud, camera_cloud, ground_height, network_input, truth_boxes
 from detection.kitti_format import KittiObject, boxes_of
 from detection.lidar_inputs import lidar_boxes, lidar_rows, turned_boxes, turned_cloud
+from detection.models.added_classes import with_classes
 from detection.models.batch import DetectorModel, PointBatch
 from detection.models.layers import set_batchnorm_momentum
 from detection.models.presets import PRESETS, Preset
@@ -61,7 +62,7 @@ class TrainSettings:
     optimiser        the one-cycle schedule, over `steps`
     scene            scene augmentation, or None (the thesis uses none)
     paste            ground truth sampling, or None; objects come from `paste_frames` frames drawn at the start
-    warm_start       weights to begin with; input channels they lack start at zero
+    warm_start       weights to begin with; input channels they lack start at zero, classes as a copy of similar ones
     save_every, log_every  steps
     """
 
@@ -221,7 +222,8 @@ class Trainer:
         if not hasattr(self.model, "training_losses"):
             raise ValueError(f"preset {settings.preset}: its network can be imported and run, but not trained")
         if settings.warm_start is not None:
-            copy_matching(load_checkpoint(settings.warm_start)[0], self.model)
+            start = load_checkpoint(settings.warm_start)[0]
+            copy_matching(with_classes(start, self.preset.classes), self.model)
         self.optimiser = AdamOneCycle(self.model, settings.steps, settings.optimiser)
         self.database = object_database(samples, self.preset, settings)
         self.epoch_steps = max(1, len(samples) // (settings.batch_size * self.workers.count))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from detection.models.added_classes import with_classes
 from detection.models.batch import PointBatch
 from detection.models.compact import (
     CompactPointRCNN,
@@ -110,3 +111,22 @@ def test_box_head_has_no_batch_normalisation() -> None:
     head = tiny().points.box_hidden
     assert isinstance(head, PointLayer)
     assert head.bn is None
+
+
+def test_an_added_class_starts_as_a_copy_of_the_one_it_counts_as() -> None:
+    """Old classes keep their scores, vans get those of cars, and a region of a car is refined as before."""
+    torch.manual_seed(2)
+    old = small(points=512, width=0.5).build().eval()
+    classes = ("Car", "Van", "Pedestrian", "Cyclist")
+    new = with_classes(old, classes).eval()
+    cloud = torch.cat([torch.rand(1, 512, 3) * torch.tensor([20.0, 2.0, 40.0]), torch.zeros(1, 512, 2)], dim=2)
+    with torch.no_grad():
+        before, after = old.points(cloud).logits, new.points(cloud).logits
+        torch.testing.assert_close(after, before[..., [0, 0, 1, 2]])
+        features = torch.randn(2, old.points.backbone.out_channels)
+        rois = torch.tensor([[10.0, 1.5, 20, 1.5, 1.6, 4, 0.3]] * 2)
+        found = old.regions(cloud[0], Regions(rois, torch.tensor([0, 2]), features, torch.zeros(2)))
+        same = new.regions(cloud[0], Regions(rois, torch.tensor([1, 3]), features, torch.zeros(2)))
+    torch.testing.assert_close(same, found)
+    with pytest.raises(ValueError, match="nothing to start Tram"):
+        with_classes(old, ("Car", "Tram"))
