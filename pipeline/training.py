@@ -71,7 +71,7 @@ class CloudSamples:
 
 @dataclass(frozen=True)
 class MaskSamples:
-    """Frames with class maps, as `pipeline.semantics.network` reads them."""
+    """Frames with class maps, as `pipeline.semantics.training` reads them."""
 
     dataset: Dataset
 
@@ -80,17 +80,6 @@ class MaskSamples:
 
     def __getitem__(self, index: int, /) -> Frame:
         return self.dataset[index]
-
-
-@dataclass(frozen=True)
-class SegmentationSettings:
-    """Training of the segmentation network; see `pipeline.semantics.network.train_segmenter`."""
-
-    steps: int = 3000
-    batch: int = 6
-    crop: tuple[int, int] = (256, 384)
-    rate: float = 3e-3
-    seed: int = 0
 
 
 def cloud_samples(dataset: Dataset, config: Config, run: RunFolder) -> LabelledFrames:
@@ -164,8 +153,8 @@ def train_detection(config: Config, samples: LabelledFrames, out: Path) -> Path:
 
 
 def train_segmentation(config: Config, dataset: Dataset, out: Path) -> Path:
-    """`pipeline.semantics.network.train_segmenter` on frames with class maps."""
-    from pipeline.semantics.network import train_segmenter
+    """`pipeline.semantics.training.train_segmenter` on frames with class maps."""
+    from pipeline.semantics.training import SegmentationSettings, train_segmenter
 
     if not dataset[0].has("semantics"):
         raise UsageError(f"{dataset.root}: frame {dataset.ids[0]} has no class map to train segmentation on")
@@ -176,9 +165,7 @@ def train_segmentation(config: Config, dataset: Dataset, out: Path) -> Path:
 
     out.mkdir(parents=True, exist_ok=True)
     samples: Any = MaskSamples(dataset)
-    return train_segmenter(
-        samples, out / "model", settings.steps, settings.batch, settings.crop, settings.rate, settings.seed, report
-    )
+    return train_segmenter(samples, out / "model", settings, report)
 
 
 def training_facts(config: Config) -> dict[str, Any]:

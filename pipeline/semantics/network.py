@@ -7,8 +7,8 @@ The logits are a quarter of the image wide and high; labels come from their bili
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from pipeline.errors import DataError
-from pipeline.semantics.conventions import CLASSES, NONE
+from pipeline.runner.atomic import write_bytes
+from pipeline.semantics.conventions import CLASSES
 
 WEIGHTS = Path(__file__).parent / "weights"
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -114,114 +115,55 @@ class NetworkSegmenter:
         return full[0, 0].clamp(0, 1).numpy()
 
 
-def train_segmenter(
-    samples: Sequence[LabelledImage],
-    out: Path,
-    steps: int = 3000,
-    batch: int = 6,
-    crop: tuple[int, int] = (256, 384),
-    rate: float = 3e-3,
-    seed: int = 0,
-    progress: Callable[[int, float], None] | None = None,
-) -> Path:
-    """Train on random crops by cross-entropy and write OUT.safetensors with its card OUT.json; returns the weights.
-
-    Rare classes count more (inverse square root of their frequency in the first 50 samples). AdamW with one cosine
-    cycle. `progress(step, loss)` is called every 50 steps. The same arguments give the same weights on one machine.
-    """
-    if not len(samples) or steps < 1:
-        raise ValueError(f"segmentation training: expected samples and steps, got {len(samples)} and {steps}")
-    torch.manual_seed(seed)
-    random = np.random.default_rng(seed)
-    model = StreetSegmenter().train()
-    optimiser = torch.optim.AdamW(model.parameters(), lr=rate, weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=steps)
-    weights = _class_weights(samples)
-    losses = []
-    for step in range(steps):
-        images, labels = _crops(samples, batch, crop, random)
-        logits = F.interpolate(model(images), size=crop, mode="bilinear", align_corners=False)
-        loss = F.cross_entropy(logits, labels, weight=weights, ignore_index=NONE)
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        schedule.step()
-        losses.append(float(loss.detach()))
-        if progress is not None and (step % 50 == 49 or step == steps - 1):
-            progress(step + 1, float(np.mean(losses[-50:])))
-    training = {"steps": steps, "batch": batch, "crop": list(crop), "rate": rate, "seed": seed, "samples": len(samples)}
-    return save_segmenter(model.eval(), out, {**training, "final_loss": float(np.mean(losses[-50:]))})
-
-
-def _class_weights(samples: Sequence[LabelledImage]) -> Tensor:
-    """(19,) weights, 1 on average over the classes that occur."""
-    seen = min(50, len(samples))
-    counts = sum(np.bincount(samples[i].semantics.reshape(-1), minlength=256)[: len(CLASSES)] for i in range(seen))
-    frequency = np.asarray(counts, dtype=np.float64) / max(float(np.sum(counts)), 1.0)
-    weights = np.where(frequency > 0, 1 / np.sqrt(np.maximum(frequency, 1e-4)), 0)
-    return torch.from_numpy(weights / weights[weights > 0].mean()).float()
-
-
-def _crops(
-    samples: Sequence[LabelledImage], batch: int, crop: tuple[int, int], random: np.random.Generator
-) -> tuple[Tensor, Tensor]:
-    """(B, 3, h, w) images and (B, h, w) labels: random places, mirrored half of the time, brightness changed."""
-    images, labels = [], []
-    for _ in range(batch):
-        sample = samples[int(random.integers(len(samples)))]
-        image, semantics = _padded(sample.image, crop), _padded(sample.semantics, crop, NONE)
-        top = int(random.integers(image.shape[0] - crop[0] + 1))
-        left = int(random.integers(image.shape[1] - crop[1] + 1))
-        image = image[top : top + crop[0], left : left + crop[1]]
-        semantics = semantics[top : top + crop[0], left : left + crop[1]]
-        if random.random() < 0.5:
-            image, semantics = image[:, ::-1], semantics[:, ::-1]
-        bright = np.clip(image * random.uniform(0.7, 1.3) + random.uniform(-20, 20, 3), 0, 255).astype(np.uint8)
-        images.append(image_tensor(bright))
-        labels.append(torch.from_numpy(np.ascontiguousarray(semantics)).long())
-    return torch.cat(images), torch.stack(labels)
-
-
-def _padded(values: NDArray[Any], crop: tuple[int, int], fill: int = 0) -> NDArray[Any]:
-    """At least the crop's size, filled at the bottom and on the right."""
-    missing = [max(0, want - have) for want, have in zip(crop, values.shape[:2])]
-    borders = [(0, missing[0]), (0, missing[1])] + [(0, 0)] * (values.ndim - 2)
-    return np.pad(values, borders, constant_values=fill) if any(missing) else values
-
-
 def save_segmenter(model: StreetSegmenter, out: Path, training: dict[str, Any]) -> Path:
     """Write OUT.safetensors and its card OUT.json."""
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     weights = out.with_suffix(".safetensors")
-    weights.parent.mkdir(parents=True, exist_ok=True)
-    save_file({name: value.contiguous() for name, value in model.state_dict().items()}, str(weights))
+    content = save({name: value.contiguous() for name, value in model.state_dict().items()})
+    write_bytes(weights, content)
     card = {
         "architecture": "StreetSegmenter",
+        "sha256": hashlib.sha256(content).hexdigest(),
         "classes": list(CLASSES),
         "convention": "cityscapes_trainIds",
         "data": "synthetic street scenes of this project",
         "training": training,
     }
-    out.with_suffix(".json").write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
+    write_bytes(out.with_suffix(".json"), (json.dumps(card, indent=2) + "\n").encode())
     return weights
 
 
 def load_segmenter(path_or_name: str | Path) -> NetworkSegmenter:
     """Weights from a .safetensors file, or embedded ones by name ("street-small").
 
-    Raises DataError when there are none or when they are of another network.
+    Raises DataError when there are none, when they are not those of their card, or of another network.
     """
-    from safetensors.torch import load_file
+    from safetensors import SafetensorError
+    from safetensors.torch import load
 
     path = Path(path_or_name)
     path = path if path.suffix == ".safetensors" else WEIGHTS / f"{path_or_name}.safetensors"
     if not path.is_file():
         have = ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none"
         raise DataError(path, "weights of the segmentation network", "no such file", f"embedded: {have}")
+    content = path.read_bytes()
+    found, stated = hashlib.sha256(content).hexdigest(), _stated_hash(path.with_suffix(".json"))
+    if found != stated:
+        raise DataError(path, f"SHA-256 {stated[:12]}... as its card says", f"{found[:12]}...")
     model = StreetSegmenter()
     try:
-        model.load_state_dict(load_file(str(path)))
-    except RuntimeError as error:
+        model.load_state_dict(load(content))
+    except (RuntimeError, SafetensorError) as error:
         raise DataError(path, "weights of StreetSegmenter", str(error).splitlines()[0]) from None
     return NetworkSegmenter(model)
+
+
+def _stated_hash(card: Path) -> str:
+    """The SHA-256 in the card of weights. Raises DataError without a card or a hash in it."""
+    try:
+        return str(json.loads(card.read_text(encoding="utf-8"))["sha256"])
+    except OSError:
+        raise DataError(card, "the card of the weights beside them", "no such file") from None
+    except (ValueError, KeyError, TypeError):
+        raise DataError(card, "a JSON object with the SHA-256 of the weights", "none") from None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,8 +12,9 @@ import pytest
 import torch
 
 from pipeline.errors import DataError
-from pipeline.semantics.network import NetworkSegmenter, StreetSegmenter, load_segmenter, train_segmenter
+from pipeline.semantics.network import NetworkSegmenter, StreetSegmenter, load_segmenter, save_segmenter
 from pipeline.semantics.onnx_model import OnnxSegmenter
+from pipeline.semantics.training import SegmentationSettings, train_segmenter
 
 
 @dataclass(frozen=True)
@@ -44,9 +47,8 @@ def test_training_learns_and_weights_survive_the_file(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     samples = [picture(random) for _ in range(8)]
     seen: list[tuple[int, float]] = []
-    path = train_segmenter(
-        samples, tmp_path / "tiny", steps=60, batch=4, crop=(96, 128), progress=lambda s, l: seen.append((s, l))
-    )
+    settings = SegmentationSettings(steps=60, batch=4, crop=(96, 128), zoom=1.1, jitter=0.2, gamma=0, grey=0)
+    path = train_segmenter(samples, tmp_path / "tiny", settings, progress=lambda s, l: seen.append((s, l)))
     assert [step for step, _ in seen] == [50, 60]
     segmenter = load_segmenter(path)
     fresh = picture(np.random.default_rng(99))
@@ -59,7 +61,6 @@ def test_training_learns_and_weights_survive_the_file(tmp_path: Path) -> None:
 
 def test_soft_source_gives_scores_and_network_source_labels(tmp_path: Path) -> None:
     from pipeline.data.frame import Frame
-    from pipeline.semantics.network import save_segmenter
     from pipeline.semantics.sources import open_semantics
 
     torch.manual_seed(0)
@@ -75,8 +76,22 @@ def test_soft_source_gives_scores_and_network_source_labels(tmp_path: Path) -> N
 
 def test_training_is_repeatable(tmp_path: Path) -> None:
     samples = [picture(np.random.default_rng(1))]
-    paths = [train_segmenter(samples, tmp_path / n, steps=2, batch=1, crop=(64, 64), seed=3) for n in ("a", "b")]
+    settings = SegmentationSettings(steps=2, batch=1, crop=(64, 64), seed=3)
+    paths = [train_segmenter(samples, tmp_path / name, settings) for name in ("a", "b")]
     assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+def test_weights_that_are_not_their_cards_are_refused(tmp_path: Path) -> None:
+    weights = save_segmenter(StreetSegmenter(), tmp_path / "one", {})
+    assert load_segmenter(weights).model.training is False
+    changed = bytearray(weights.read_bytes())
+    changed[-1] ^= 1
+    weights.write_bytes(bytes(changed))
+    with pytest.raises(DataError, match="as its card says"):
+        load_segmenter(weights)
+    weights.with_suffix(".json").unlink()
+    with pytest.raises(DataError, match="card of the weights"):
+        load_segmenter(weights)
 
 
 def test_missing_and_foreign_weights_are_refused(tmp_path: Path) -> None:
@@ -84,7 +99,10 @@ def test_missing_and_foreign_weights_are_refused(tmp_path: Path) -> None:
         load_segmenter("no-such-weights")
     from safetensors.torch import save_file
 
-    save_file({"a": torch.zeros(1)}, str(tmp_path / "x.safetensors"))
+    foreign = tmp_path / "x.safetensors"
+    save_file({"a": torch.zeros(1)}, str(foreign))
+    digest = hashlib.sha256(foreign.read_bytes()).hexdigest()
+    foreign.with_suffix(".json").write_text(json.dumps({"sha256": digest}))
     with pytest.raises(DataError, match="weights of StreetSegmenter"):
         load_segmenter(tmp_path / "x.safetensors")
 

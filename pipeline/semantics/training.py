@@ -1,0 +1,132 @@
+"""Training of the segmentation network on frames with class maps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from completion.samples import Augmentation, disturb_image
+from pipeline.semantics.conventions import CLASSES, NONE
+from pipeline.semantics.network import LabelledImage, StreetSegmenter, image_tensor, save_segmenter
+
+
+@dataclass(frozen=True)
+class SegmentationSettings:
+    """One training run.
+
+    steps, batch  updates, crops per update        crop  (height, width) in pixels
+    rate          largest learning rate of one cosine cycle
+    zoom          crops are enlarged by up to this factor or reduced by its inverse
+    jitter, gamma, noise   of colours, as `completion.samples.Augmentation`; grey  share of crops without colour
+    """
+
+    steps: int = 3000
+    batch: int = 6
+    crop: tuple[int, int] = (256, 384)
+    rate: float = 3e-3
+    seed: int = 0
+    zoom: float = 1.5
+    jitter: float = 0.4
+    gamma: float = 0.5
+    noise: float = 8.0
+    grey: float = 0.15
+
+
+def train_segmenter(
+    samples: Sequence[LabelledImage],
+    out: Path,
+    settings: SegmentationSettings,
+    progress: Callable[[int, float], None] | None = None,
+) -> Path:
+    """Train on random crops by cross-entropy and write OUT.safetensors with its card OUT.json; returns the weights.
+
+    Rare classes count more (inverse square root of their frequency in the first 50 samples). AdamW with one cosine
+    cycle. `progress(step, loss)` is called every 50 steps. The same arguments give the same weights on one machine.
+    """
+    steps = settings.steps
+    if not len(samples) or steps < 1:
+        raise ValueError(f"segmentation training: expected samples and steps, got {len(samples)} and {steps}")
+    torch.manual_seed(settings.seed)
+    random = np.random.default_rng(settings.seed)
+    model = StreetSegmenter().train()
+    optimiser = torch.optim.AdamW(model.parameters(), lr=settings.rate, weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, settings.rate, total_steps=steps)
+    weights = _class_weights(samples)
+    losses = []
+    for step in range(steps):
+        images, labels = _crops(samples, settings, random)
+        logits = F.interpolate(model(images), size=settings.crop, mode="bilinear", align_corners=False)
+        loss = F.cross_entropy(logits, labels, weight=weights, ignore_index=NONE)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+        losses.append(float(loss.detach()))
+        if progress is not None and (step % 50 == 49 or step == steps - 1):
+            progress(step + 1, float(np.mean(losses[-50:])))
+    training = asdict(settings) | {"samples": len(samples), "final_loss": float(np.mean(losses[-50:]))}
+    return save_segmenter(model.eval(), out, training)
+
+
+def _class_weights(samples: Sequence[LabelledImage]) -> Tensor:
+    """(19,) weights, 1 on average over the classes that occur."""
+    seen = min(50, len(samples))
+    counts = sum(np.bincount(samples[i].semantics.reshape(-1), minlength=256)[: len(CLASSES)] for i in range(seen))
+    frequency = np.asarray(counts, dtype=np.float64) / max(float(np.sum(counts)), 1.0)
+    weights = np.where(frequency > 0, 1 / np.sqrt(np.maximum(frequency, 1e-4)), 0)
+    return torch.from_numpy(weights / weights[weights > 0].mean()).float()
+
+
+def _crops(
+    samples: Sequence[LabelledImage], settings: SegmentationSettings, random: np.random.Generator
+) -> tuple[Tensor, Tensor]:
+    """(B, 3, h, w) images and (B, h, w) labels. Two crops are taken of every frame that is read."""
+    colours = Augmentation(jitter=settings.jitter, gamma=settings.gamma, noise=settings.noise)
+    images, labels = [], []
+    for number in range(settings.batch):
+        if number % 2 == 0:
+            sample = samples[int(random.integers(len(samples)))]
+            whole, classes = sample.image, sample.semantics
+        image, semantics = _crop(whole, classes, settings, random)
+        image = disturb_image(image, colours, random)
+        if random.random() < settings.grey:
+            image = np.repeat(image.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
+        images.append(image_tensor(image))
+        labels.append(torch.from_numpy(np.ascontiguousarray(semantics)).long())
+    return torch.cat(images), torch.stack(labels)
+
+
+def _crop(
+    image: NDArray[np.uint8], semantics: NDArray[np.uint8], settings: SegmentationSettings, random: np.random.Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """A random place at a random size, mirrored half of the time, brought to the crop's size."""
+    height, width = settings.crop
+    factor = float(np.exp(random.uniform(-1, 1) * np.log(settings.zoom)))
+    taken = (round(height / factor), round(width / factor))
+    image, semantics = _padded(image, taken), _padded(semantics, taken, NONE)
+    top = int(random.integers(image.shape[0] - taken[0] + 1))
+    left = int(random.integers(image.shape[1] - taken[1] + 1))
+    image = image[top : top + taken[0], left : left + taken[1]]
+    semantics = semantics[top : top + taken[0], left : left + taken[1]]
+    if random.random() < 0.5:
+        image, semantics = image[:, ::-1], semantics[:, ::-1]
+    size = (width, height)
+    resized = cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_LINEAR)
+    labels = cv2.resize(np.ascontiguousarray(semantics), size, interpolation=cv2.INTER_NEAREST)
+    return resized.astype(np.uint8), labels.astype(np.uint8)
+
+
+def _padded(values: NDArray[Any], crop: tuple[int, int], fill: int = 0) -> NDArray[Any]:
+    """At least the crop's size, filled at the bottom and on the right."""
+    missing = [max(0, want - have) for want, have in zip(crop, values.shape[:2])]
+    borders = [(0, missing[0]), (0, missing[1])] + [(0, 0)] * (values.ndim - 2)
+    return np.pad(values, borders, constant_values=fill) if any(missing) else values
