@@ -38,9 +38,8 @@ class CameraCloud:
 
 def camera_cloud(frame: PointFrame) -> CameraCloud:
     """Points inside the image (of this frame's own size), in front of the camera and within `AREA`."""
-    velo = frame.points[:, :3].astype(np.float64)
-    xyz = velo @ frame.T_cam_velo[:3, :3].T + frame.T_cam_velo[:3, 3]
-    inside = in_image(frame)
+    xyz = _camera_xyz(frame)
+    inside = _in_image(frame, xyz)
     for axis, (low, high) in enumerate(AREA):
         inside &= (xyz[:, axis] >= low) & (xyz[:, axis] <= high)
     return CameraCloud(xyz[inside].astype(np.float32), frame.points[inside, 3:])
@@ -179,7 +178,15 @@ def mirrored(cloud: CameraCloud) -> CameraCloud:
 
 def in_image(frame: PointFrame) -> NDArray[np.bool_]:
     """(N,) whether a point is in front of the camera and inside the image."""
-    xyz = frame.points[:, :3].astype(np.float64) @ frame.T_cam_velo[:3, :3].T + frame.T_cam_velo[:3, 3]
+    return _in_image(frame, _camera_xyz(frame))
+
+
+def _camera_xyz(frame: PointFrame) -> Array:
+    return frame.points[:, :3].astype(np.float64) @ frame.T_cam_velo[:3, :3].T + frame.T_cam_velo[:3, 3]
+
+
+def _in_image(frame: PointFrame, xyz: Array) -> NDArray[np.bool_]:
+    """`in_image` with the points (N, 3) in the camera frame."""
     projected = xyz @ frame.P2[:, :3].T + frame.P2[:, 3]
     height, width = frame.image_size
     # PointRCNN and OpenPCDet divide by z of the rectified frame, not by the homogeneous coordinate.

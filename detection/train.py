@@ -64,6 +64,7 @@ class TrainSettings:
     paste            ground truth sampling, or None; objects come from `paste_frames` frames drawn at the start
     warm_start       weights to begin with; input channels they lack start at zero, classes as a copy of similar ones
     save_every, log_every  steps
+    cache_mb         memory for the visible points of frames, which are then read once instead of once per epoch
     """
 
     preset: str = "small"
@@ -78,6 +79,7 @@ class TrainSettings:
     warm_start: str | None = None
     save_every: int = 500
     log_every: int = 20
+    cache_mb: int = 1500
 
 
 @dataclass(frozen=True)
@@ -152,16 +154,34 @@ def object_database(samples: LabelledFrames, preset: Preset, settings: TrainSett
     return [item for scene in scenes for item in cut_objects(scene, settings.paste.min_points)]
 
 
-def _load_scene(samples: LabelledFrames, index: int, preset: Preset) -> tuple[TrainingScene, str]:
-    """The scene of a frame, or of the next usable one: with visible points and, where the preset asks, a box."""
-    for shift in range(len(samples)):
-        frame, labels = samples[(index + shift) % len(samples)]
-        scene = training_scene(frame, labels, preset)
-        if len(scene.points) and (len(scene.boxes) or not preset.skip_empty_frames):
-            return scene, frame.id
-    raise ValueError(
-        f"training: none of the {len(samples)} frames has visible points and an object of {', '.join(preset.classes)}"
-    )
+class Scenes:
+    """The training scenes of a data source, each made from its files once while `megabytes` of memory last."""
+
+    def __init__(self, samples: LabelledFrames, preset: Preset, megabytes: int) -> None:
+        self.samples, self.preset = samples, preset
+        self.free = megabytes * 10**6
+        self.kept: dict[int, TrainingScene] = {}
+
+    def __getitem__(self, index: int) -> TrainingScene:
+        """The scene of a frame, or of the next usable one: with visible points and, where the preset asks, a box."""
+        count = len(self.samples)
+        for place in range(index, index + count):
+            scene = self._scene(place % count)
+            if len(scene.points) and (len(scene.boxes) or not self.preset.skip_empty_frames):
+                return scene
+        raise ValueError(
+            f"training: none of the {count} frames has visible points and an object of {', '.join(self.preset.classes)}"
+        )
+
+    def _scene(self, index: int) -> TrainingScene:
+        if index in self.kept:
+            return self.kept[index]
+        scene = training_scene(*self.samples[index], self.preset)
+        size = scene.points.nbytes + scene.height.nbytes
+        if size <= self.free:
+            self.free -= size
+            self.kept[index] = scene
+        return scene
 
 
 @dataclass(frozen=True)
@@ -212,7 +232,7 @@ class Trainer:
     def __init__(self, settings: TrainSettings, samples: LabelledFrames, device: str) -> None:
         if len(samples) == 0:
             raise ValueError("training: expected at least one frame, got an empty data source")
-        self.settings, self.samples, self.device = settings, samples, torch.device(device)
+        self.settings, self.device = settings, torch.device(device)
         self.workers = _Workers.current()
         if settings.preset not in PRESETS:
             raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, got {settings.preset!r}")
@@ -225,15 +245,17 @@ class Trainer:
             start = load_checkpoint(settings.warm_start)[0]
             copy_matching(with_classes(start, self.preset.classes), self.model)
         self.optimiser = AdamOneCycle(self.model, settings.steps, settings.optimiser)
+        self.scenes = Scenes(samples, self.preset, settings.cache_mb)
         self.database = object_database(samples, self.preset, settings)
         self.epoch_steps = max(1, len(samples) // (settings.batch_size * self.workers.count))
 
     def batch(self, step: int) -> PointBatch:
         """The frames of a step, prepared with the step's own random numbers."""
         rng = np.random.default_rng([self.settings.seed, 3, step, self.workers.rank])
-        order = frame_order(step, len(self.samples), self.settings, self.workers.rank, self.workers.count)
-        scenes = [_load_scene(self.samples, index, self.preset)[0] for index in order]
-        prepared = [prepare_sample(scene, self.preset, self.settings, self.database, rng) for scene in scenes]
+        order = frame_order(step, len(self.scenes.samples), self.settings, self.workers.rank, self.workers.count)
+        prepared = [
+            prepare_sample(self.scenes[index], self.preset, self.settings, self.database, rng) for index in order
+        ]
         return collate(prepared, self.device)
 
     def step(self, step: int) -> dict[str, float]:
@@ -280,7 +302,7 @@ class Trainer:
 def _settings_text(settings: TrainSettings, processes: int) -> str:
     """What must agree for a run to be continued."""
     values = dataclasses.asdict(settings)
-    for free in ("save_every", "log_every"):
+    for free in ("save_every", "log_every", "cache_mb"):
         del values[free]
     return json.dumps({**values, "processes": processes}, sort_keys=True)
 

@@ -254,3 +254,18 @@ def test_box_frames_are_all_easy() -> None:
 def test_a_preset_that_cannot_be_trained_is_refused(name, message) -> None:
     with pytest.raises(ValueError, match=message):
         Trainer(TrainSettings(preset=name), BoxFrames(1), "cpu")
+
+
+def test_scenes_kept_in_memory_change_nothing(tmp_path) -> None:
+    class Counted(BoxFrames):
+        reads = 0
+
+        def __getitem__(self, index):
+            self.reads += 1
+            return super().__getitem__(index)
+
+    kept, read_again = Counted(2, cars=2), Counted(2, cars=2)
+    first = train(settings(cache_mb=100), kept, tmp_path / "a")
+    second = train(settings(cache_mb=0), read_again, tmp_path / "b")
+    assert same_weights(first, second)
+    assert (kept.reads, read_again.reads) == (2, 6)
