@@ -96,11 +96,21 @@ def embed(room: str, run: Path, name: str, dataset: Dataset, cloud: str, complet
     else:
         figures = detection_figures(source, dataset, cloud, completer)
         card |= {"cloud": cloud, "held_out": figures, "score_threshold": figures["car, BEV IoU 0.7, hard"]["threshold"]}
+    card = without_places(card)
     target = embedded_folder(room) / f"{name}.safetensors"
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(source, target)
     target.with_suffix(".json").write_text(json.dumps(card, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     return target
+
+
+def without_places(value: Any) -> Any:
+    """The card with folders of the machine it was made on cut down to their last name."""
+    if isinstance(value, dict):
+        return {key: without_places(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [without_places(inner) for inner in value]
+    return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value
 
 
 def main(argv: Sequence[str] | None = None) -> int:
