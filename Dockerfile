@@ -5,7 +5,8 @@
 #     --config configs/kitti.yaml --data KITTI --out runs/kitti --stage augment
 FROM python:3.12-slim-bookworm
 
-# Libraries that Open3D and OpenMP code load at run time.
+# Libraries that Open3D and OpenMP code load at run time; their versions are those of the Debian release named above.
+# hadolint ignore=DL3008
 RUN apt-get update \
  && apt-get install -y --no-install-recommends libgl1 libgomp1 libusb-1.0-0 \
  && rm -rf /var/lib/apt/lists/*
@@ -18,10 +19,10 @@ COPY pipeline pipeline
 COPY configs configs
 # Compiled numba kernels are kept beside the package, so the user who runs it has to own them.
 ARG PIP_EXTRA_INDEX_URL=
-RUN useradd --create-home runner \
+RUN useradd --create-home --uid 1000 runner \
  && pip install --no-cache-dir . \
  && mkdir -p /data/runs && chown -R runner /data
 ENV NUMBA_CACHE_DIR=/home/runner/.cache/numba MPLBACKEND=Agg
-USER runner
+USER 1000
 WORKDIR /data
 ENTRYPOINT ["run_pipeline"]

@@ -24,6 +24,7 @@ class Explanation:
     side     "label" or "detection"      line    its line in the file (place in the list for objects in memory)
     status   matched, missed, ignored or false positive
     reason   the rule that decided, countable; `detail` adds the numbers
+    partner  of a match: the line of the object matched, on the other side; 0 otherwise
     """
 
     frame: str
@@ -33,6 +34,7 @@ class Explanation:
     status: str
     reason: str
     detail: str = ""
+    partner: int = 0
 
     def __str__(self) -> str:
         detail = f" ({self.detail})" if self.detail else ""
@@ -115,7 +117,7 @@ class _Story:
             return _words(labels, g, "label", LEFT_OUT, *self._why_ignored(g))
         if d >= 0 and self.detection_flag[d] == VALID:
             score = f"line {detections.line[d]}, score {detections.values[d, SCORE]:g}, IoU {self._iou(g, d):.3f}"
-            return _words(labels, g, "label", MATCHED, "found", score)
+            return _words(labels, g, "label", MATCHED, "found", score, int(detections.line[d]))
         if d >= 0:
             return _words(labels, g, "label", LEFT_OUT, "found by an ignored detection", f"line {detections.line[d]}")
         return _words(labels, g, "label", MISSED, *self._why_missed(g))
@@ -166,7 +168,8 @@ class _Story:
     def detection(self, d: int) -> Explanation:
         detections = self.matcher.pair.detections
         status, reason, detail = self._verdict(d)
-        return _words(detections, d, "detection", status, reason, detail)
+        partner = int(self.matcher.pair.labels.line[self.taken_by[d]]) if status == MATCHED else 0
+        return _words(detections, d, "detection", status, reason, detail, partner)
 
     def _verdict(self, d: int) -> tuple[str, str, str]:
         labels, detections = self.matcher.pair.labels, self.matcher.pair.detections
@@ -205,9 +208,11 @@ class _Story:
         return next(iou for label, iou in self.of_detection[d] if label == g)
 
 
-def _words(table: ObjectTable, row: int, side: str, status: str, reason: str, detail: str = "") -> Explanation:
+def _words(
+    table: ObjectTable, row: int, side: str, status: str, reason: str, detail: str = "", partner: int = 0
+) -> Explanation:
     frame = table.frames[int(np.searchsorted(table.offsets, row, side="right")) - 1]
-    return Explanation(frame, side, int(table.line[row]), table.types[table.type[row]], status, reason, detail)
+    return Explanation(frame, side, int(table.line[row]), table.types[table.type[row]], status, reason, detail, partner)
 
 
 def orientation_errors(matcher: Matcher, target: Target, level: int) -> tuple[float, float] | None:

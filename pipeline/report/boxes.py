@@ -29,6 +29,7 @@ class DrawnBox:
 
     corners  (8, 3) metres, LiDAR frame, bottom face first
     wrong    a missed label or a false positive
+    met      of a label that was found: the score of the detection that found it
     """
 
     kind: str
@@ -38,6 +39,7 @@ class DrawnBox:
     score: float | None
     corners: NDArray[np.float64]
     wrong: bool = False
+    met: float | None = None
 
 
 def drawn_boxes(
@@ -45,11 +47,13 @@ def drawn_boxes(
     calibration: Calibration,
     size: tuple[int, int],
     verdicts: Mapping[int, Explanation] | None = None,
+    partners: Sequence[KittiObject] = (),
 ) -> list[DrawnBox]:
     """Paths of all objects that have a 3D box.
 
     size      (height, width) of the image in pixels
     verdicts  place in `objects` -> what became of the object, where that is known
+    partners  of labels: the detections that their verdicts speak of
     """
     places = [i for i, item in enumerate(objects) if item.type in DRAWN and min(item.size) > 0]
     solid = [objects[i] for i in places]
@@ -60,7 +64,8 @@ def drawn_boxes(
         paths = wireframe(points, calibration, size), footprint(points, calibration)
         title = ", ".join(filter(None, (_title(item), verdict_text(verdict))))
         velo = calibration.cam_to_velo(points)
-        found.append(DrawnBox(item.type, *paths, title, item.score, velo, is_wrong(verdict)))
+        met = partners[verdict.partner - 1].score if partners and verdict is not None and verdict.partner else None
+        found.append(DrawnBox(item.type, *paths, title, item.score, velo, is_wrong(verdict), met))
     return found
 
 

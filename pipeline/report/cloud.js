@@ -3,7 +3,7 @@
 const AugCloud = (() => {
   const EDGES = [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]];
   const VIEWS = {
-    behind: { yaw: 0, pitch: 0.42, distance: 31, target: [14, 0, -1.2] },
+    behind: { yaw: 0, pitch: 0.42, distance: 30, target: [17, 0, -1.2] },
     above: { yaw: 0, pitch: 1.5, distance: 62, target: [28, 0, 0] },
     side: { yaw: Math.PI / 2, pitch: 0.25, distance: 42, target: [18, 0, 0] },
     driver: { yaw: 0, pitch: 0.03, distance: 6, target: [6, 0, 0] },
@@ -156,10 +156,10 @@ const AugCloud = (() => {
       const colours = { truth: "#2bd4a4", found: "#ff8a3d", other: "#c48bff" }, least = AugCloud.least;
       for (const box of this.boxes) {
         if (!shown[box.kind] || (box.kind === "found" && box.score < least)) continue;
-        const corners = box.corners.map((corner) => place(...corner));
+        const corners = box.corners.map((corner) => place(...corner)), wrong = box.wrong || (box.met !== null && box.met < least);
         this.context.strokeStyle = colours[box.kind];
-        this.context.lineWidth = (box.wrong ? 2.6 : 1.5) * ratio;
-        this.context.setLineDash(box.wrong ? [5 * ratio, 3 * ratio] : []);
+        this.context.lineWidth = (wrong ? 2.6 : 1.5) * ratio;
+        this.context.setLineDash(wrong ? [5 * ratio, 3 * ratio] : []);
         this.context.beginPath();
         for (const [a, b] of EDGES) {
           if (corners[a][2] < 0.5 || corners[b][2] < 0.5) continue;

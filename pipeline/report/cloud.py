@@ -150,7 +150,7 @@ def object_pixels(frame: Frame) -> NDArray[np.bool_]:
 
 STILL_WIDTH, STILL_HEIGHT = 760, 420
 # Where the page's camera stands at first: looking at this point (metres, LiDAR frame) from behind and above.
-TARGET, DISTANCE, PITCH, FOCAL = (14.0, 0.0, -1.2), 31.0, np.deg2rad(24.0), 0.85
+TARGET, DISTANCE, PITCH, FOCAL = (17.0, 0.0, -1.2), 30.0, np.deg2rad(24.0), 0.85
 
 
 def still_picture(cloud: FrameCloud, boxes: list[tuple[str, NDArray[np.float64]]]) -> pictures.RGB:
@@ -170,7 +170,8 @@ def still_picture(cloud: FrameCloud, boxes: list[tuple[str, NDArray[np.float64]]
         place, depth = still_pixels(cloud.points[chosen])
         seen = (depth > 1) & (place >= 0).all(axis=1) & (place < (STILL_WIDTH - 1, STILL_HEIGHT - 1)).all(axis=1)
         column, row = place[seen].astype(int).T
-        picture[row, column] = (*colour, 255)
+        for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
+            picture[row + down, column + right] = (*colour, 255)
     colours = {"truth": (0, 158, 115, 255), "found": (213, 94, 0, 255)}
     for kind, corners in boxes:
         place, depth = still_pixels(corners)

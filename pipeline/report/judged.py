@@ -159,7 +159,8 @@ def _interval_text(item: Interval) -> str:
 
 
 def difference_rows(first: Judged, second: Judged) -> list[list[str]]:
-    """AP of this run, of the other, and the paired difference with its interval, per class, metric and level.
+    """AP of this run, of the other, and the paired difference with its interval, per class, metric and level; last,
+    "sure" where the interval is without 0.
 
     Only the frames that both have are compared, empty when there is none; rows without any AP are left out.
     """
@@ -180,6 +181,7 @@ def difference_rows(first: Judged, second: Judged) -> list[list[str]]:
             f"{row.ap:.1f}",
             f"{row.ap - row.difference:.1f}",
             f"{row.difference:+.1f} [{row.low:+.1f}, {row.high:+.1f}]",
+            "sure" if row.low > 0 or row.high < 0 else "",
         ]
         for row in paired_differences(evaluations, RESAMPLING)
         if row.target.metric in ("3d", "bev") and (row.ap > 0 or row.ap != row.difference)
@@ -206,7 +208,7 @@ class CurvePanel:
 
 
 def curve_panels(judged: Judged) -> list[CurvePanel]:
-    """3D and bird's-eye curves of every class with objects and detections."""
+    """3D and bird's-eye curves of every class of which something was found."""
     if judged.evaluation is None:
         return []
     panels = []
@@ -214,7 +216,7 @@ def curve_panels(judged: Judged) -> list[CurvePanel]:
         for target in strictest(judged.evaluation, metric):
             curves = judged.evaluation.curves(target)
             paths = [(level, _curve_path(c.precision())) for level, c in zip(LEVELS, curves) if len(c.thresholds)]
-            if paths:
+            if any(c.precision().any() for c in curves if len(c.thresholds)):
                 values = judged.evaluation.average_precision(target)
                 area = " / ".join("-" if value is None else f"{value:.1f}" for value in values)
                 panels.append(CurvePanel(f"{target.cls}, {METRIC_NAMES[metric]}, IoU {target.iou:g}", paths, area))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,9 +29,11 @@ from pipeline.report.judged import (
     judge,
     mistakes,
 )
-from pipeline.report.tables import ap_header, ap_rows, depth_rows, number
+from pipeline.report.tables import DEPTH_NAMES, ap_header, ap_rows, depth_rows
 from pipeline.report.views import Display, FrameView, MistakeView, frame_view, mistake_view
 from pipeline.runner.atomic import write_text
+from pipeline.versions import made_with
+from pipeline.weights import detection_weights, detector_name
 
 FOLDER = Path(__file__).resolve().parent
 # The worst mistakes listed at the top, and the share of the shown frames that is chosen for them.
@@ -50,6 +53,8 @@ class Page:
     curves: list[CurvePanel] = field(default_factory=list)
     other: RunFolder | None = None
     differences: list[list[str]] = field(default_factory=list)
+    settings: list[tuple[str, str]] = field(default_factory=list)
+    least: float = -math.inf
 
 
 def write_report(config: Config, run: RunFolder, dataset: Dataset, frames: tuple[str, ...]) -> Path:
@@ -62,8 +67,9 @@ def write_report(config: Config, run: RunFolder, dataset: Dataset, frames: tuple
     judged = judge(config, run, dataset, frames)
     judged_other = judge(config, other, dataset, frames) if other is not None else Judged()
     found = mistakes(judged)
+    least = score_threshold(config)
     shown = chosen_frames(frames, found, config.report.frames)
-    display = Display(hover_step(len(shown)), point_budget(len(shown)), judged, other, judged_other)
+    display = Display(hover_step(len(shown)), point_budget(len(shown)), judged, other, judged_other, least)
     page = Page(
         views=[frame_view(dataset[frame_id], FrameFiles(run, frame_id), display) for frame_id in shown],
         total=len(frames),
@@ -73,6 +79,8 @@ def write_report(config: Config, run: RunFolder, dataset: Dataset, frames: tuple
         curves=curve_panels(judged),
         other=other,
         differences=difference_rows(judged, judged_other),
+        settings=settings_of(config),
+        least=least,
     )
     write_text(run.report, render(run, page))
     write_beside(config, run, dataset, frames, judged)
@@ -97,6 +105,37 @@ def write_beside(
     write = write_rrd if kind == "rrd" else write_mcap
     path = run.report.parent / f"{run.root.name}.{kind}"
     return [write(path, scenes(run, dataset, frames), run.root.name)]
+
+
+def settings_of(config: Config) -> list[tuple[str, str]]:
+    """(name, value) of what decides the results; the whole configuration stands at the end of the page."""
+    cloud = config.augment.preset + (f", depth from {config.augment.depth_from}" if config.augment.depth_from else "")
+    made = config.made_with or made_with()
+    return [
+        ("data", Path(config.data.root).name if config.data.root else config.data.name),
+        ("completion", Path(config.completion.model).name),
+        ("cloud", cloud),
+        ("detector", Path(_detector(config)).name),
+        ("seed", str(config.seed)),
+        ("AugLiDAR", " ".join(filter(None, (made.get("auglidar"), made.get("git"))))),
+    ]
+
+
+def score_threshold(config: Config) -> float:
+    """The score from which the detector's card takes a box to be meant; -inf where there is no card to say so."""
+    try:
+        card = detection_weights(config)[-1]
+    except UsageError:
+        return -math.inf
+    least = _read_json(card).get("score_threshold")
+    return float(least) if isinstance(least, (int, float)) else -math.inf
+
+
+def _detector(config: Config) -> str:
+    try:
+        return detector_name(config)
+    except UsageError:
+        return config.detection.model
 
 
 def other_run(config: Config) -> RunFolder | None:
@@ -163,6 +202,7 @@ def render(run: RunFolder, page: Page) -> str:
         steps=metrics.get("augmentation", []),
         failures=failures.get("failures", []),
         config=run.config.read_text(encoding="utf-8") if run.config.is_file() else "",
+        unfound=unfound(metrics, page.curves),
         legends=legends({map.legend for view in page.views for map in view.maps}),
         bev=pictures.BirdsEye(),
         bev_scale=pictures.BEV_PIXELS_PER_METRE,
@@ -171,11 +211,12 @@ def render(run: RunFolder, page: Page) -> str:
 
 
 def depth_pairs(metrics: dict[str, Any], other: RunFolder | None) -> list[list[str]]:
-    """Depth measure, its mean, and the other run's mean when there is one."""
+    """Depth measure in words, its mean, and the other run's mean when there is one."""
+    rows = [[DEPTH_NAMES.get(name, name), value] for name, value in depth_rows(metrics)]
     if other is None:
-        return depth_rows(metrics)
-    theirs = _read_json(other.metrics).get("depth", {}).get("mean", {})
-    return [[name, value, number(theirs[name]) if name in theirs else "-"] for name, value in depth_rows(metrics)]
+        return rows
+    theirs = dict(depth_rows(_read_json(other.metrics)))
+    return [[*row, theirs.get(name, "-")] for row, (name, _) in zip(rows, depth_rows(metrics))]
 
 
 def headline(metrics: dict[str, Any], frames: int) -> list[tuple[str, str, str]]:
@@ -186,10 +227,21 @@ def headline(metrics: dict[str, Any], frames: int) -> list[tuple[str, str, str]]
             if (row["class"], row["metric"], row["iou"]) == ("Car", metric, 0.7) and row["moderate"] is not None:
                 remark = f"moderate, IoU 0.7, R{row['recall_points']}, {row['n_gt'][1]} cars"
                 facts.append((f"{row['moderate']:.1f}", name, remark))
+    depth = metrics.get("depth", {}).get("mean", {})
+    if depth:
+        mae, rmse = depth["mae_mm"] / 1000, depth["rmse_mm"] / 1000
+        facts.append((f"{mae:.2f} m", "mean depth error", f"RMSE {rmse:.2f} m, {metrics['depth']['frames']} frames"))
     steps = metrics.get("augmentation", [])
     if steps:
-        facts.append((f"{steps[-1]['out']:,}", "points per frame", "mean of the augmented clouds"))
+        facts.append((f"{steps[-1]['out']:,}", "points per frame", "mean of the clouds given to the detector"))
     return facts
+
+
+def unfound(metrics: dict[str, Any], curves: Sequence[CurvePanel]) -> list[str]:
+    """Classes with objects but without a curve: nothing of them was found in 3D or from above."""
+    drawn = {panel.title.split(",")[0] for panel in curves}
+    classes = dict.fromkeys(row["class"] for row in metrics.get("results", []) if any(row["n_gt"]))
+    return [name for name in classes if name not in drawn]
 
 
 def legends(used: set[str]) -> dict[str, dict[str, Any]]:

@@ -9,19 +9,38 @@
   }
 
   // Scores are raw values of any scale: the slider runs over their ranks.
-  const found = [...document.querySelectorAll(".box.found")];
+  const found = [...document.querySelectorAll(".box.found, .box.other")];
   const scores = found.map((path) => Number(path.dataset.score)).sort((a, b) => a - b);
-  const slider = byId("score");
-  const applyScore = () => {
-    const share = Number(slider.value) / 100;
-    const least = share === 0 || !scores.length ? -Infinity : scores[Math.min(scores.length - 1, Math.floor(share * scores.length))];
+  // They start at the threshold of the detector's card. A label whose detection is not shown counts as missed.
+  const slider = byId("score"), threshold = slider.dataset.least === undefined ? -Infinity : Number(slider.dataset.least);
+  const labels = [...document.querySelectorAll(".box.truth[data-met]")];
+  const applyScore = (least) => {
     byId("score-text").textContent = least === -Infinity ? "all" : least.toFixed(2);
     for (const path of found) path.classList.toggle("low", Number(path.dataset.score) < least);
+    for (const path of labels) path.toggleAttribute("data-wrong", Number(path.dataset.met) < least);
+    for (const frame of document.querySelectorAll("article")) tally(frame);
     AugCloud.least = least;
     AugCloud.redraw();
   };
-  slider.addEventListener("input", applyScore);
-  applyScore();
+  const tally = (frame) => {
+    const view = frame.querySelector("svg.bev") || frame.querySelector("svg.photo"), text = frame.querySelector(".tally");
+    if (!view || !text) return;
+    const count = (kind) => view.querySelectorAll(`.box.${kind}`).length, shown = "found:not(.low)";
+    const judged = view.querySelector("[data-met], [data-wrong]");
+    text.textContent = `${count("truth")} true, ${count(shown)} predicted` + (judged
+      ? `: ${count("truth[data-met]:not([data-wrong])")} found, ${count("truth[data-wrong]")} missed, ${count(`${shown}[data-wrong]`)} false` : "");
+  };
+  const slide = (value) => {
+    slider.value = value;
+    const share = Number(slider.value) / 100;
+    applyScore(share === 0 || !scores.length ? -Infinity : scores[Math.min(scores.length - 1, Math.floor(share * scores.length))]);
+  };
+  const toThreshold = () => {
+    slider.value = scores.length ? (100 * scores.filter((score) => score < threshold).length) / scores.length : 0;
+    applyScore(threshold);
+  };
+  slider.addEventListener("input", () => slide(slider.value));
+  toThreshold();
 
   // Frames: J and K (or N and P) go forward and back, the list jumps.
   const frames = [...document.querySelectorAll("article")], jump = byId("jump");
@@ -45,7 +64,13 @@
     if (step) show(current() + step);
     const boxes = { 1: "truth", 2: "found" }[event.key];
     if (boxes) byId(`show-${boxes}`).click();
+    const change = { "[": -5, "]": 5 }[event.key];
+    if (change) slide(Number(slider.value) + change);
+    if (event.key === "0") { if (AugCloud.least === -Infinity) toThreshold(); else slide(0); }
+    if (event.key === "?") help();
   });
+  const help = () => byId("keys").showModal && byId("keys").showModal();
+  byId("help").addEventListener("click", help);
 
   // Values: pointing at one map of a frame reads all maps of that frame at the same place.
   const grids = new Map();

@@ -5,6 +5,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+# Depth measures in words; the keys are those of metrics.json (`completion.metrics.depth_metrics`).
+DEPTH_NAMES = {
+    "mae_mm": "mean error (MAE), mm",
+    "rmse_mm": "RMSE, mm",
+    "tmae_mm": "thresholded MAE, mm",
+    "trmse_mm": "thresholded RMSE, mm",
+    "imae_per_km": "inverse MAE, 1/km",
+    "irmse_per_km": "inverse RMSE, 1/km",
+    "rel": "relative error",
+    "squared_rel": "squared relative error",
+    "lg10": "log₁₀ error",
+    "silog": "scale-invariant log error",
+    "valid_pixels": "pixels compared",
+    "floored_pixels": "pixels raised to 0.1 m",
+    "delta_1.02": "ratio below 1.02, %",
+    "delta_1.05": "ratio below 1.05, %",
+    "delta_1.10": "ratio below 1.10, %",
+    "delta_1.25": "ratio below 1.25, %",
+    "delta_1.25^2": "ratio below 1.25², %",
+    "delta_1.25^3": "ratio below 1.25³, %",
+}
 METRIC_NAMES = {"2d": "2D box", "aos": "orientation", "bev": "bird's eye", "3d": "3D box"}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -42,6 +43,7 @@ class Display:
     points  most points of one cloud
     judged  what became of labels and detections
     other   a second run to compare with, and its objects
+    least   score from which predicted boxes are drawn at first
     """
 
     step: int
@@ -49,6 +51,7 @@ class Display:
     judged: Judged = field(default_factory=Judged)
     other: RunFolder | None = None
     other_judged: Judged = field(default_factory=Judged)
+    least: float = -math.inf
 
 
 @dataclass
@@ -140,10 +143,10 @@ def _add_boxes(frame: Frame, files: FrameFiles, display: Display, view: FrameVie
         found = display.judged.verdicts.items()
         return {place: verdict for (of, where, place), verdict in found if of == frame.id and where == side}
 
+    found = files.read_detections() if files.run.detections(frame.id).is_file() else None
     if frame.has("labels"):
-        view.truth = drawn_boxes(frame.labels, frame.calibration, frame.image_size, verdicts_of("label"))
-    if files.run.detections(frame.id).is_file():
-        found = files.read_detections()
+        view.truth = drawn_boxes(frame.labels, frame.calibration, frame.image_size, verdicts_of("label"), found or ())
+    if found is not None:
         view.found = drawn_boxes(found, frame.calibration, frame.image_size, verdicts_of("detection"))
         view.counts = counts_of(display.judged, frame.id) if frame.id in display.judged.labels else {}
 
@@ -158,30 +161,34 @@ def _add_cloud(frame: Frame, files: FrameFiles, display: Display, view: FrameVie
     view.birds_eye = pictures.data_uri(pictures.birds_eye_picture(cloud.points, cloud.measured), 10_000, quality=101)
     shown = cloud.thinned(display.points, seed=0)
     view.cloud = shown.packed() | {"boxes": _boxes_3d(view)}
-    solid = [(kind, box.corners) for kind in ("truth", "found") for box in getattr(view, kind)]
+    sure = [box for box in view.found if box.score is None or box.score >= display.least]
+    solid = [("truth", box.corners) for box in view.truth] + [("found", box.corners) for box in sure]
     view.still = pictures.data_uri(still_picture(cloud.thinned(8000, seed=0), solid), 10_000, quality=60)
 
 
 def _boxes_3d(view: FrameView) -> list[dict[str, Any]]:
     return [
-        {"kind": kind, "corners": box.corners.round(2).tolist(), "score": box.score, "wrong": box.wrong}
+        {"kind": kind, "corners": box.corners.round(2).tolist(), "score": box.score, "wrong": box.wrong, "met": box.met}
         for kind in ("truth", "found")
         for box in getattr(view, kind)
     ]
 
 
 def _add_other(frame: Frame, files: FrameFiles, display: Display, view: FrameView) -> None:
-    """The same frame in the run compared with."""
+    """The same frame in the run compared with: what differs, and its boxes."""
     if display.other is None:
         return
     other = FrameFiles(display.other, frame.id)
     if other.run.depth(frame.id).is_file():
         depth = other.read_completed().depth
-        view.other_maps.append(depth_map("completed depth", depth, display.step))
-        if frame.has("target_depth") and frame.target_depth.shape == depth.shape:
+        same = files.run.depth(frame.id).is_file() and np.array_equal(depth, files.read_completed().depth)
+        if not same:
+            view.other_maps.append(depth_map("completed depth", depth, display.step))
+        if not same and frame.has("target_depth") and frame.target_depth.shape == depth.shape:
             view.other_maps.append(error_map("error of the completed depth", depth, frame.target_depth, display.step))
     if other.run.counts(frame.id).is_file():
-        view.other_steps = other.read_counts()["steps"]
+        steps = other.read_counts()["steps"]
+        view.other_steps = steps if steps != view.steps else []
     if other.run.detections(frame.id).is_file():
         found = display.other_judged.verdicts.items()
         wrong = {place: v for (of, side, place), v in found if of == frame.id and side == "detection"}
@@ -193,6 +200,7 @@ class MistakeView:
     """A mistake in words, with a piece of the image and a link into the page (empty when its frame is not shown)."""
 
     title: str
+    facts: str
     reason: str
     kind: str
     frame: str
@@ -203,9 +211,9 @@ class MistakeView:
 def mistake_view(mistake: Mistake, frame: Frame, link: str) -> MistakeView:
     """Words and picture of a mistake."""
     item = mistake.item
-    score = "" if item.score is None else f", score {item.score:.2f}"
-    title = f"{item.type}, {item.location[2]:.0f} m{score}"
-    return MistakeView(title, mistake.reason, mistake.kind, mistake.frame, link, thumbnail(frame, mistake))
+    title = f"{item.type}, {item.location[2]:.0f}\u00a0m"
+    facts = f"frame {mistake.frame}" + ("" if item.score is None else f", score {item.score:.2f}")
+    return MistakeView(title, facts, mistake.reason, mistake.kind, mistake.frame, link, thumbnail(frame, mistake))
 
 
 def thumbnail(frame: Frame, mistake: Mistake) -> str:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from pipeline.data.kitti_object import read_labels, write_objects
 from pipeline.paths import RunFolder
 from tests.pipeline.report.scored import score_and_report
 
@@ -49,6 +51,12 @@ addEventListener("load", () => {
   said.above = view.pitch === 1.5;
   key(document.body, "j");
   said.hash = location.hash;
+  const low = () => document.querySelectorAll(".box.found.low").length;
+  said.low = low();
+  key(document.body, "0");
+  said.all = low();
+  key(document.body, "0");
+  said.back = low();
   key(document.body, "j");
   key(document.body, "1");
   said.hidden = getComputedStyle(document.querySelector(".box.truth")).display;
@@ -77,6 +85,8 @@ def browse(page: Path, profile: Path, *options: str) -> tuple[str, str]:
 
 @pytest.mark.slow
 def test_interactions_work_without_console_errors(run: RunFolder, tmp_path: Path) -> None:
+    sure = read_labels(run.detections("000000"), scored=True)
+    write_objects(run.detections("000000"), [*sure, replace(sure[0], score=-5.0)])
     text = score_and_report(run)
     run.report.write_text(text.replace("</body>", f"<script>{ACTIONS}</script></body>"), encoding="utf-8")
     document, log = browse(run.report, tmp_path / "profile", "--window-size=1200,900")
@@ -89,6 +99,8 @@ def test_interactions_work_without_console_errors(run: RunFolder, tmp_path: Path
     assert "noise-bg" not in said["legend"]  # this run has none, and the legend names only what is there
     assert said["hash"] == "#frame-1"
     assert said["hidden"] == "none"
+    # The box of score -5 is below the threshold of the detector's card: in the image and from above.
+    assert (said["low"], said["all"], said["back"]) == ("2", "0", "2")
     # Completed 9 m, foreground and true depth 8 m, background 10 m, sigma 128 / 255, error 1 m on the car.
     values = said["values"].split("|")
     assert values[1:] == ["9.00 m", "8.00 m", "10.00 m", "8.00 m", "0.50", "1.00 m"]

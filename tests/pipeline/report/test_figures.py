@@ -5,8 +5,11 @@ from __future__ import annotations
 import base64
 import json
 import re
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -92,6 +95,39 @@ def test_an_mcap_file_reads_back(recorded: list[Scene], tmp_path: Path) -> None:
     assert [message.log_time for _, channel, message in messages if channel.topic == "/cloud"] == [0, 10**8, 2 * 10**8]
 
 
+def test_messages_are_foxgloves_own(recorded: list[Scene]) -> None:
+    """Parsed by Foxglove's published definitions, which refuse a field they do not know."""
+    pytest.importorskip("foxglove_schemas_protobuf", reason="foxglove-schemas-protobuf is not installed")
+    from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+    from google.protobuf.json_format import ParseDict
+
+    from pipeline.viewers.mcap_file import messages
+
+    def spelled(value: Any) -> Any:
+        """Times as protobuf's JSON has them."""
+        if isinstance(value, list):
+            return [spelled(item) for item in value]
+        if not isinstance(value, dict):
+            return value
+        if set(value) == {"sec", "nsec"}:
+            return f"1970-01-01T00:00:0{value['sec']}.{value['nsec']:09d}Z"
+        lifetime = {"lifetime": f"{value['lifetime']['nsec'] / 1e9}s"} if "lifetime" in value else {}
+        return {key: spelled(item) for key, item in value.items()} | lifetime
+
+    parsed = {topic: spelled(message) for topic, message in messages(recorded[1])}
+    cloud = ParseDict(parsed["/cloud"], PointCloud())
+    assert cloud.timestamp.nanos == 10**8
+    assert len(cloud.data) == cloud.point_stride * len(recorded[1].cloud)
+    assert [field.name for field in cloud.fields][:4] == ["x", "y", "z", "intensity"]
+    assert {field.type for field in cloud.fields} == {1, 7}  # UINT8 and FLOAT32 of PackedElementField
+    (entity,) = ParseDict(parsed["/boxes/truth"], SceneUpdate()).entities
+    assert len(entity.cubes) == len(entity.texts) == len(recorded[1].boxes["truth"])
+    image = ParseDict(parsed["/camera/image"], CompressedImage())
+    assert (image.format, image.data[:2]) == ("jpeg", b"\xff\xd8")
+
+
 def test_messages_hold_the_fields_of_their_schemas(recorded: list[Scene]) -> None:
     from pipeline.viewers.mcap_file import TOPICS, messages
     from pipeline.viewers.schemas import SCHEMAS
@@ -110,3 +146,8 @@ def test_an_rrd_file_is_written(recorded: list[Scene], tmp_path: Path) -> None:
     assert data[:4] == b"RRF2"
     assert re.search(rb"world/cloud|/world/cloud", data)
     assert [item.name for item in tmp_path.glob("*.rrd")] == ["run.rrd"]
+    command = [sys.executable, "-m", "rerun", "rrd"]
+    subprocess.run([*command, "verify", str(path)], capture_output=True, check=True, timeout=60)
+    stats = subprocess.run([*command, "stats", str(path)], capture_output=True, text=True, check=True, timeout=60)
+    for entity in ("world/cloud", "world/truth", "world/found", "camera/image", "camera/depth", "camera/sigma"):
+        assert f"\n/{entity}: " in stats.stdout

@@ -12,6 +12,7 @@ from detection.evaluation.kitti_ap import prepare
 from detection.kitti_format import KittiObject
 from pipeline.errors import UsageError
 from pipeline.paths import RunFolder
+from pipeline.report.boxes import drawn_boxes
 from pipeline.report.judged import (
     Judged,
     Mistake,
@@ -25,6 +26,7 @@ from pipeline.report.judged import (
 )
 from pipeline.report.page import chosen_frames
 from tests.pipeline.report.scored import score_and_report, write_run
+from tests.pipeline.tiny_kitti import CALIBRATION
 
 
 def car(x: float, z: float, score: float | None = None) -> KittiObject:
@@ -64,6 +66,16 @@ def test_verdicts_name_the_place_in_the_list(example: Judged) -> None:
     assert example.verdicts["a", "label", 0].status == "matched"
     assert verdict_text(example.verdicts["a", "label", 1]) == "missed: no detection overlaps"
     assert verdict_text(None) == ""
+
+
+def test_a_found_label_knows_the_score_that_found_it(example: Judged) -> None:
+    verdicts_of_a = {place: verdict for (frame, side, place), verdict in example.verdicts.items()
+                     if (frame, side) == ("a", "label")}  # fmt: skip
+    boxes = drawn_boxes(example.labels["a"], CALIBRATION, (400, 960), verdicts_of_a, example.detections["a"])
+    assert [box.met for box in boxes] == [0.9, None]
+    assert [box.wrong for box in boxes] == [False, True]
+    assert example.verdicts["a", "detection", 0].partner == 1
+    assert example.verdicts["a", "detection", 1].partner == 0
 
 
 def test_ap_comes_with_its_interval(example: Judged) -> None:
@@ -107,7 +119,7 @@ def test_two_runs_stand_side_by_side(run: RunFolder, tmp_path: Path) -> None:
     score_and_report(other)
     text = score_and_report(run, f"report.compare={other.root}")
     assert text.count('class="box other"') == 6
-    assert re.search(r"<td>mae_mm</td><td>1,000</td><td>3,000</td>", text)
+    assert re.search(r"<td>mean error \(MAE\), mm</td><td>1,000</td><td>3,000</td>", text)
     assert text.count("<h4>other</h4>") == 3
 
 
@@ -124,5 +136,5 @@ def test_a_missed_object_is_listed_with_its_picture(run: RunFolder) -> None:
     label.write_text("".join(format_line(item) + "\n" for item in lines))
     run.detections("000001").write_text("")
     text = score_and_report(run)
-    assert "<b>missed Car, 12 m</b><span>no detection overlaps</span><small>frame 000001</small>" in text
+    assert "<b>Car, 12\u00a0m</b><small>frame 000001</small><span>no detection overlaps</span>" in text
     assert 'href=#frame-2 class="mistake missed"' in text
