@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from torch import nn
@@ -68,8 +70,9 @@ def _preset(
     score_threshold: float,
     nms_iou: float,
     build: Callable[[], nn.Module],
+    cell: dict[str, float] | None = None,
 ) -> Preset:
-    options: dict[str, Any] = {"features": list(features), "classes": list(classes)}
+    options: dict[str, Any] = {"features": list(features), "classes": list(classes), **(cell or {})}
     inputs = InputSettings(0, "all", tuple(features), frame="lidar")
     # The best 500 of all classes together remain (OpenPCDet's NMS_POST_MAXSIZE).
     outputs = OutputSettings(score_threshold, nms_iou, probability=True, nms_per_class=False, limit=500)
@@ -83,18 +86,38 @@ def pointpillars(features: Sequence[str] = INTENSITY, classes: Sequence[str] = A
     return _preset("pointpillars", features, classes, 0.1, 0.01, lambda: PointPillars(settings))
 
 
-def pointpillars_small(features: Sequence[str] = INTENSITY, classes: Sequence[str] = ALL_CLASSES) -> Preset:
-    """PointPillars for a CPU: pillars of 32 cm, half the channels, fewer convolutions."""
-    settings = PillarSettings(_SMALL_PILLARS, 3 + len(features), 32, _SMALL_PILLAR_BEV, _anchor_classes(classes))
-    return _preset("pointpillars_small", features, classes, 0.1, 0.01, lambda: PointPillars(settings))
+def _coarser(grid: VoxelGrid, cell: float, usual: float) -> tuple[VoxelGrid, dict[str, float]]:
+    """The grid with cells of `cell` metres seen from above, and the option that says so; none for the usual size.
+
+    Its far and outer borders move out so that every stride divides the number of cells (multiples of 16).
+    """
+    if cell == usual:
+        return grid, {}
+    length = 16 * cell * math.ceil((grid.high[0] - grid.low[0]) / (16 * cell) - 1e-6)
+    half = 8 * cell * math.ceil((grid.high[1] - grid.low[1]) / (16 * cell) - 1e-6)
+    low = (grid.low[0], -half, grid.low[2])
+    high = (grid.low[0] + length, half, grid.high[2])
+    return replace(grid, low=low, high=high, size=(cell, cell, grid.size[2])), {"cell": cell}
+
+
+def pointpillars_small(
+    features: Sequence[str] = INTENSITY, classes: Sequence[str] = ALL_CLASSES, cell: float = 0.32
+) -> Preset:
+    """PointPillars for a CPU: pillars of 32 cm (`cell` in metres), half the channels, fewer convolutions."""
+    grid, option = _coarser(_SMALL_PILLARS, cell, 0.32)
+    settings = PillarSettings(grid, 3 + len(features), 32, _SMALL_PILLAR_BEV, _anchor_classes(classes))
+    return _preset("pointpillars_small", features, classes, 0.1, 0.01, lambda: PointPillars(settings), option)
 
 
 def _voxels(features: Sequence[str], classes: Sequence[str], bev: BevSettings) -> VoxelSettings:
     return VoxelSettings(KITTI_VOXELS, 3 + len(features), KITTI_WIDTHS, bev, _anchor_classes(classes))
 
 
-def _small_voxels(features: Sequence[str], classes: Sequence[str]) -> VoxelSettings:
-    return VoxelSettings(_SMALL_VOXELS, 3 + len(features), _SMALL_WIDTHS, _SMALL_BEV, _anchor_classes(classes))
+def _small_voxels(
+    features: Sequence[str], classes: Sequence[str], cell: float
+) -> tuple[VoxelSettings, dict[str, float]]:
+    grid, option = _coarser(_SMALL_VOXELS, cell, 0.1)
+    return VoxelSettings(grid, 3 + len(features), _SMALL_WIDTHS, _SMALL_BEV, _anchor_classes(classes)), option
 
 
 def second(features: Sequence[str] = INTENSITY, classes: Sequence[str] = ALL_CLASSES) -> Preset:
@@ -103,10 +126,12 @@ def second(features: Sequence[str] = INTENSITY, classes: Sequence[str] = ALL_CLA
     return _preset("second", features, classes, 0.1, 0.01, lambda: SECOND(settings))
 
 
-def second_small(features: Sequence[str] = INTENSITY, classes: Sequence[str] = ALL_CLASSES) -> Preset:
-    """SECOND for a CPU: voxels of 10 cm, about half the channels."""
-    settings = _small_voxels(features, classes)
-    return _preset("second_small", features, classes, 0.1, 0.01, lambda: SECOND(settings))
+def second_small(
+    features: Sequence[str] = INTENSITY, classes: Sequence[str] = ALL_CLASSES, cell: float = 0.1
+) -> Preset:
+    """SECOND for a CPU: voxels of 10 cm (`cell` in metres, seen from above), about half the channels."""
+    settings, option = _small_voxels(features, classes, cell)
+    return _preset("second_small", features, classes, 0.1, 0.01, lambda: SECOND(settings), option)
 
 
 def voxel_rcnn(features: Sequence[str] = INTENSITY, classes: Sequence[str] = ("Car",)) -> Preset:
@@ -116,11 +141,14 @@ def voxel_rcnn(features: Sequence[str] = INTENSITY, classes: Sequence[str] = ("C
     return _preset("voxel_rcnn", features, classes, 0.3, 0.1, lambda: VoxelRCNN(settings, stages, VoxelPoolSettings()))
 
 
-def voxel_rcnn_small(features: Sequence[str] = INTENSITY, classes: Sequence[str] = ALL_CLASSES) -> Preset:
+def voxel_rcnn_small(
+    features: Sequence[str] = INTENSITY, classes: Sequence[str] = ALL_CLASSES, cell: float = 0.1
+) -> Preset:
     """Voxel-RCNN for a CPU, all classes: the trunk of `second_small`, 64 grid points per RoI."""
-    settings, stages = _small_voxels(features, classes), _stages(512, 64, _SMALL_ROIS)
+    settings, option = _small_voxels(features, classes, cell)
+    stages = _stages(512, 64, _SMALL_ROIS)
     pool = VoxelPoolSettings(grid=4, radii=(0.8, 1.6, 3.2), channels=16, width=128)
-    return _preset("voxel_rcnn_small", features, classes, 0.1, 0.1, lambda: VoxelRCNN(settings, stages, pool))
+    return _preset("voxel_rcnn_small", features, classes, 0.1, 0.1, lambda: VoxelRCNN(settings, stages, pool), option)
 
 
 def pv_rcnn(features: Sequence[str] = INTENSITY, classes: Sequence[str] = ALL_CLASSES) -> Preset:
@@ -136,12 +164,15 @@ def pv_rcnn(features: Sequence[str] = INTENSITY, classes: Sequence[str] = ALL_CL
     )
 
 
-def pv_rcnn_small(features: Sequence[str] = INTENSITY, classes: Sequence[str] = ALL_CLASSES) -> Preset:
+def pv_rcnn_small(
+    features: Sequence[str] = INTENSITY, classes: Sequence[str] = ALL_CLASSES, cell: float = 0.1
+) -> Preset:
     """PV-RCNN for a CPU: the trunk of `second_small`, 768 keypoints, 64 grid points per RoI."""
-    settings, stages = _small_voxels(features, classes), _stages(512, 64, _SMALL_ROIS)
+    settings, option = _small_voxels(features, classes, cell)
+    stages = _stages(512, 64, _SMALL_ROIS)
     pool = GridPoolSettings(4, BallSpec((0.8, 1.6), (16, 16), (32, 32)), 128)
     return _preset(
-        "pv_rcnn_small", features, classes, 0.1, 0.1, lambda: PVRCNN(settings, stages, _SMALL_KEYPOINTS, pool)
+        "pv_rcnn_small", features, classes, 0.1, 0.1, lambda: PVRCNN(settings, stages, _SMALL_KEYPOINTS, pool), option
     )
 
 

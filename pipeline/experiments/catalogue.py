@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from pipeline.errors import UsageError
-from pipeline.experiments import chapter_2_3, chapter_4, chapter_5
+from pipeline.experiments import chapter_2_3, chapter_4, chapter_5, chapter_5_exact, chapter_5_figures
 from pipeline.experiments.tables import Table
 from pipeline.settings import nearest_name
 
-TABLES: tuple[Table, ...] = (*chapter_2_3.TABLES, *chapter_4.TABLES, *chapter_5.TABLES)
+TABLES: tuple[Table, ...] = (
+    *chapter_2_3.TABLES,
+    *chapter_4.TABLES,
+    *chapter_5.TABLES,
+    *chapter_5_exact.TABLES,
+    *chapter_5_figures.TABLES,
+)
 
 
 def find(kind: str, number: str) -> Table:

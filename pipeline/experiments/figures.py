@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from pipeline.experiments import chapter_5_drawings
 from pipeline.experiments.intervals import Estimate, estimate
 from pipeline.experiments.plan import TableResult
 from pipeline.experiments.tables import Column, Row
@@ -140,6 +141,7 @@ def draw_expected_loss(result: TableResult, figure: Any) -> None:
 
 
 DRAWINGS: dict[str, Callable[[TableResult, Any], None]] = {
+    **chapter_5_drawings.DRAWINGS,
     "dots": draw_dots,
     "curve": draw_curve,
     "scatter": draw_scatter,
@@ -159,7 +161,7 @@ def draw(result: TableResult, path: Path) -> Path | None:
         return None
     kind = table.drawing if table.drawing in DRAWINGS else "dots"
     size = (3 + 1.9 * len(table.columns), 1.8 + 0.28 * len(table.rows)) if kind == "dots" else (11.0, 4.6)
-    figure = new_figure(*size)
+    figure = new_figure(*chapter_5_drawings.SIZES.get(kind, size))
     DRAWINGS[kind](result, figure)
     legend = LEGENDS.get(kind, "")
     figure.suptitle(f"{table.heading}: {table.title}" + (f"\n{legend}" if legend else ""), fontsize=9)

@@ -120,6 +120,11 @@ def margin(
         for label in (better, worse)
     ]
     low, high = float("nan"), float("nan")
+    draws = [outcomes[label][0].draws.get(number_name(table.row(label), column), []) for label in (better, worse)]
+    if draws[0] and len(draws[0]) == len(draws[1]):
+        paired = sign * (np.asarray(draws[0], np.float64) - np.asarray(draws[1], np.float64))
+        low, high = np.percentile(paired, [50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE)])
+        return Estimate(differences[0], float("nan"), float(low), float(high), "paired bootstrap of the runs")
     if len(frames[0]) == len(frames[1]):
         low, high = over_frames(sign * (frames[0] - frames[1]))
     return Estimate(differences[0], float("nan"), low, high, "paired bootstrap over frames")

@@ -32,9 +32,10 @@ def describe(order: Order, result: TableResult) -> list[str]:
 def command(order: Order, result: TableResult) -> str:
     """The command that makes the table."""
     data = "" if order.data is None else f" --data {order.data.name}"
+    rows = f" --rows {result.table.lidar_rows}" if result.table.lidar_rows else ""
     return (
         f"run_pipeline --stage experiment --{result.table.kind} {result.table.number} --budget {order.budget} "
-        f"--seeds {order.seeds}{data}"
+        f"--seeds {order.seeds}{rows}{data}"
     )
 
 

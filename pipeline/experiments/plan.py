@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -101,11 +101,12 @@ def carry_out(plan: Plan, say: Callable[[str], None] = print) -> None:
 
 @dataclass(frozen=True)
 class TableResult:
-    """A table with what was found: outcomes per row label, one per seed, and a verdict per claim."""
+    """A table with what was found: outcomes per row label, one per seed, a verdict per claim, the runs' folders."""
 
     table: Table
     outcomes: dict[str, list[Outcome]]
     verdicts: list[Verdict]
+    folders: dict[str, list[Path]] = field(default_factory=dict)
 
 
 def gather(plan: Plan, table: Table) -> TableResult:
@@ -116,4 +117,5 @@ def gather(plan: Plan, table: Table) -> TableResult:
         done = [outcome for outcome in found if outcome is not None]
         if len(done) == len(found):
             outcomes[label] = done
-    return TableResult(table, outcomes, judge(table, outcomes))
+    folders = {label: [run.folder(plan.order.out) for run in runs] for label, runs in plan.runs[table.name].items()}
+    return TableResult(table, outcomes, judge(table, outcomes), folders)

@@ -26,6 +26,7 @@ KINDS: dict[str, str] = {
     "completion": "pipeline.experiments.completion_runs",
     "analysis": "pipeline.experiments.analysis_runs",
     "detection": "pipeline.experiments.detection_runs",
+    "cloud": "pipeline.experiments.cloud_runs",
 }
 
 
@@ -37,11 +38,14 @@ class Outcome:
     frames     name -> value per test frame (NaN where a frame has none), for numbers that are means over frames:
                intervals of a single seed are made from them
     intervals  name -> (low, high), 95 %, for numbers that are no means over frames (AP): the run's own bootstrap
+    draws      name -> value per resample of the test frames, the same resamples for every run on the same frames:
+               differences of two single runs are judged by them
     """
 
     numbers: dict[str, float]
     frames: dict[str, list[float]] = field(default_factory=dict)
     intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
+    draws: dict[str, list[float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -151,6 +155,7 @@ def read_result(run: Run, out: Path) -> Outcome | None:
             {name: _number(value) for name, value in content["numbers"].items()},
             {name: [_number(value) for value in values] for name, values in content["frames"].items()},
             {name: (_number(low), _number(high)) for name, (low, high) in content["intervals"].items()},
+            {name: [_number(value) for value in values] for name, values in content.get("draws", {}).items()},
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UsageError(f"{path}: not the result of a run ({error}); remove it and give the command again") from None
@@ -188,6 +193,7 @@ def do_run(run: Run, out: Path, data: Path | None, say: Callable[[str], None] = 
         "numbers": {name: _plain_number(value) for name, value in sorted(outcome.numbers.items())},
         "frames": {name: [_plain_number(v) for v in values] for name, values in sorted(outcome.frames.items())},
         "intervals": {name: [_plain_number(v) for v in pair] for name, pair in sorted(outcome.intervals.items())},
+        "draws": {name: [_plain_number(v) for v in values] for name, values in sorted(outcome.draws.items())},
     }
     write_text(folder / "result.json", json.dumps(record, indent=1) + "\n")
     return read_result(run, out) or outcome

@@ -101,6 +101,7 @@ class Table:
     notes      how our runs differ from the thesis'
     drawing    how its figure is drawn: a name in `figures.DRAWINGS`
     needs      what a run takes ("synthetic world or KITTI depth", ...)
+    lidar_rows rows asked for (see `with_lidar_rows`), 0 when the table is as it stands
     """
 
     number: str
@@ -114,6 +115,7 @@ class Table:
     notes: tuple[str, ...] = ()
     drawing: str = "dots"
     needs: str = "synthetic world"
+    lidar_rows: int = 0
 
     def __post_init__(self) -> None:
         if self.kind not in ("table", "figure"):
@@ -135,13 +137,15 @@ class Table:
 
     @property
     def name(self) -> str:
-        """ "table_4.5"; stem of the files written."""
-        return f"{self.kind}_{self.number}"
+        """ "table_4.5", "table_5.3_16_rows"; stem of the files written."""
+        return f"{self.kind}_{self.number}" + (f"_{self.lidar_rows}_rows" if self.lidar_rows else "")
 
     @property
     def heading(self) -> str:
         """ "Table 4.5"."""
-        return f"{self.kind.capitalize()} {self.number}"
+        return f"{self.kind.capitalize()} {self.number}" + (
+            f" at {self.lidar_rows} LiDAR rows" if self.lidar_rows else ""
+        )
 
     def row(self, label: str) -> Row:
         """The row with this label. KeyError when there is none."""
@@ -167,7 +171,7 @@ class Table:
                 changed.append(row)
         left = {row.label for row in changed}
         claims = tuple(claim for claim in self.claims if _labels(claim) <= left)
-        return replace(self, rows=tuple(changed), claims=claims)
+        return replace(self, rows=tuple(changed), claims=claims, lidar_rows=rows)
 
 
 def _labels(claim: Claim | RankClaim) -> set[str]:

@@ -28,6 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seeds", type=int, metavar="N", help="trainings of each row (default: 3)")
     add("--rows", type=int, choices=(64, 32, 16, 8, 0), help="LiDAR rows, where a table has them")
     add("--out", metavar="DIR", help=f"folder of runs and tables (default: {DEFAULT_OUT})")
+    add("--finished", action="store_true", help="run nothing: write the tables from the runs that are finished")
     add("--dry-run", action="store_true", help="say what would be run, how long it takes and what it writes")
     add("--json", action="store_true", help="print JSON instead of text")
 
@@ -44,7 +45,8 @@ def run(args: argparse.Namespace) -> int:
     if args.dry_run:
         print(_dry_run(plan, args.json))
         return 0
-    carry_out(plan, lambda text: print(text, file=sys.stderr, flush=True))
+    if not args.finished:
+        carry_out(plan, lambda text: print(text, file=sys.stderr, flush=True))
     _report(plan, args.json)
     return 0
 

@@ -1,0 +1,101 @@
+"""How large and how long a detection experiment is: smoke (tests), small (this project's results), paper (GPU)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+# Where the seconds below were measured; another machine needs another time, not other results.
+MACHINE = "one core of a busy 2-core AMD EPYC server, torch 2.13, process time"
+
+
+@dataclass(frozen=True)
+class DetectorChoice:
+    """The network that stands for a detector of the thesis at a budget.
+
+    preset, options   `detection.models.presets.PRESETS[preset](**options)`; the point features are added
+    features          point columns beside x y z before those that an input adds (source, semantic)
+    dense             name of an option that is True for completed depth and False for raw LiDAR; "" for none
+    seconds_per_step  of two clouds; seconds_per_frame of detection; measured on MACHINE
+    """
+
+    preset: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    features: tuple[str, ...] = ()
+    dense: str = ""
+    seconds_per_step: float = 0.4
+    seconds_per_frame: float = 0.2
+
+
+@dataclass(frozen=True)
+class DetectionBudget:
+    """Data, training and test of every detection run.
+
+    train_frames, test_frames   frames; size (height, width) of synthetic images, None for KITTI's own
+    steps, batch   updates and clouds of each; peak of the one-cycle learning rate
+    augmented      scene augmentation (flip, turn, scale); the thesis uses none (5.4.4)
+    cloud_points   most points of a stored cloud; the thesis draws 50k of dense depth
+    detectors      networks by the thesis' names
+    completer      network of the completed depth: an embedded name or a path of weights
+    masks          where object masks come from, as `augment.semantics`
+    resamples      of the bootstrap over test frames
+    """
+
+    train_frames: int
+    test_frames: int
+    size: tuple[int, int] | None
+    steps: int
+    batch: int
+    peak: float
+    augmented: bool
+    cloud_points: int
+    detectors: Mapping[str, DetectorChoice]
+    completer: str = "selection_small"
+    masks: str = "truth"
+    resamples: int = 300
+    seconds_per_data_frame: float = 2.5
+
+
+_POINT = ("height", "range")
+_RAW = ("intensity",)
+
+
+def _small(points: int, width: float, seconds: float) -> DetectorChoice:
+    return DetectorChoice("small", {"points": points, "width": width}, _POINT, "", seconds)
+
+
+def _voxel(preset: str, options: Mapping[str, Any], seconds: float) -> DetectorChoice:
+    return DetectorChoice(preset, {**options, "classes": ["Car"]}, _RAW, "", seconds, 0.5)
+
+
+_TINY = _small(512, 0.1, 0.15)
+_SMALL = {
+    "PointRCNN2": _small(4096, 0.5, 0.45),
+    "PointPillars": _voxel("pointpillars_small", {"cell": 0.64}, 0.9),
+    "SECOND": _voxel("second_small", {"cell": 0.2}, 1.2),
+    "Voxel-RCNN": _voxel("voxel_rcnn_small", {"cell": 0.2}, 1.6),
+    "PV-RCNN": _voxel("pv_rcnn_small", {"cell": 0.2}, 2.0),
+}
+_SMOKE = {
+    "PointRCNN2": _TINY,
+    "PointPillars": _voxel("pointpillars_small", {"cell": 2.56}, 0.2),
+    "SECOND": _voxel("second_small", {"cell": 0.8}, 0.2),
+    "Voxel-RCNN": _voxel("voxel_rcnn_small", {"cell": 0.8}, 0.3),
+    "PV-RCNN": _voxel("pv_rcnn_small", {"cell": 0.8}, 0.4),
+}
+_PAPER = {
+    "PointRCNN": DetectorChoice("pointrcnn", seconds_per_step=30, seconds_per_frame=8),
+    "PointRCNN2": DetectorChoice("thesis", {}, (), "dense", seconds_per_step=60, seconds_per_frame=20),
+    "PointPillars": DetectorChoice("pointpillars", {}, _RAW, "", 12, 3),
+    "SECOND": DetectorChoice("second", {}, _RAW, "", 12, 3),
+    "Voxel-RCNN": DetectorChoice("voxel_rcnn", {}, _RAW, "", 15, 3),
+    "PV-RCNN": DetectorChoice("pv_rcnn", {}, _RAW, "", 25, 5),
+}
+
+DETECTION: dict[str, DetectionBudget] = {
+    "smoke": DetectionBudget(2, 2, (96, 320), 2, 1, 0.004, False, 3000, _SMOKE, resamples=10),
+    "small": DetectionBudget(120, 60, None, 150, 2, 0.004, True, 30_000, _SMALL),
+    # 50 epochs of two clouds, no augmentation (thesis 5.4.4).
+    "paper": DetectionBudget(3712, 3769, None, 92_800, 2, 0.002, False, 50_000, _PAPER, resamples=1000),
+}

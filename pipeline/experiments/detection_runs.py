@@ -1,0 +1,193 @@
+"""Runs of kind "detection": clouds of a recipe, a detector trained on them, its AP on clouds of the test frames.
+
+Settings of a recipe: `input` (fields of `InputRecipe`), `detector` (a name in the budget), `rows` (LiDAR rows), and
+`test_input` (fields that differ in the test clouds: train clean, test noisy).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from detection.evaluation.bootstrap import Resampling
+from pipeline.errors import UsageError
+from pipeline.experiments import detection_scores as scores
+from pipeline.experiments.cloud_cache import CloudCache, DepthCache, short_hash
+from pipeline.experiments.detection_budget import DETECTION, DetectionBudget, DetectorChoice
+from pipeline.experiments.example import write_example
+from pipeline.experiments.inputs import InputRecipe
+from pipeline.experiments.runs import Context, Cost, Outcome
+from pipeline.experiments.tables import Recipe
+from pipeline.experiments.worlds import World, open_world, world_identity
+from pipeline.frame_files import FrameFiles
+from pipeline.paths import RunFolder
+from pipeline.pointcloud.taxonomy import LABELS
+from pipeline.settings import nearest_name, plain, with_changes
+
+if TYPE_CHECKING:
+    from detection.kitti_format import KittiObject
+    from detection.train import TrainProgress, TrainSettings
+    from pipeline.data import Dataset
+
+BUDGETS: Mapping[str, DetectionBudget] = DETECTION
+_MEGABYTE = 1e6
+
+
+@dataclass(frozen=True)
+class DetectionRecipe:
+    """Which clouds train and test which detector."""
+
+    detector: str
+    train_input: InputRecipe
+    test_input: InputRecipe
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Any]) -> DetectionRecipe:
+        """From the settings of a recipe. UsageError for an unknown field."""
+        known = ("input", "detector", "rows", "test_input")
+        for key in settings:
+            if key not in known:
+                raise UsageError(f"detection recipe: unknown setting {key!r}; {nearest_name(key, known)}")
+        base = InputRecipe(rows=int(settings.get("rows", 64)))
+        train_input = with_changes(base, settings.get("input", {}), "input")
+        test_input = with_changes(train_input, settings.get("test_input", {}), "test_input")
+        return cls(str(settings.get("detector", "PointRCNN2")), train_input, test_input)
+
+
+def data_identity(data: Path | None, budget: DetectionBudget) -> Any:
+    """Plain values that say which frames a run uses."""
+    return world_identity(data, budget.train_frames, budget.test_frames, budget.size)
+
+
+def cost(recipe: Recipe, budget: DetectionBudget) -> Cost:
+    """Training and detection; frames and completed depth are made once per experiment folder."""
+    choice = detector_choice(DetectionRecipe.of(recipe.settings), budget)
+    frames = budget.train_frames + budget.test_frames
+    seconds = budget.steps * choice.seconds_per_step * budget.batch / 2 + budget.test_frames * choice.seconds_per_frame
+    clouds = 26.0 * budget.cloud_points * frames
+    return Cost(seconds + 0.15 * frames, clouds, budget.seconds_per_data_frame * frames, 5 * _MEGABYTE * frames)
+
+
+def detector_choice(recipe: DetectionRecipe, budget: DetectionBudget) -> DetectorChoice:
+    """The budget's network for a detector of the thesis. UsageError when it has none."""
+    if recipe.detector not in budget.detectors:
+        raise UsageError(f"unknown detector {recipe.detector!r}; {nearest_name(recipe.detector, budget.detectors)}")
+    return budget.detectors[recipe.detector]
+
+
+def world_of(context: Context) -> World:
+    """The frames of a run."""
+    budget = context.budget
+    return open_world(
+        context.out / "data", context.data, budget.train_frames, budget.test_frames, budget.size, context.say
+    )
+
+
+def clouds_of(dataset: Dataset, recipe: InputRecipe, context: Context) -> CloudCache:
+    """The clouds of a data set by a recipe, made if they are missing."""
+    from pipeline.semantics.sources import open_semantics
+
+    budget: DetectionBudget = context.budget
+    name = "boxes" if recipe.masks == "boxes" else budget.masks
+    masks = open_semantics(name) if recipe.settings.needs_semantics else None
+    depth = DepthCache(context.out / "data" / f"of-{short_hash(str(dataset.root))}", budget.completer)
+    cache = CloudCache(dataset, recipe, depth, masks, name if masks is not None else "", budget.cloud_points)
+    cache.prepare(context.say)
+    return cache
+
+
+def run(recipe: Recipe, context: Context) -> Outcome:
+    """Trains and tests one detector; continues from what a killed run left in its folder."""
+    wanted = DetectionRecipe.of(recipe.settings)
+    world = world_of(context)
+    weights = train_detector(wanted, clouds_of(world.train, wanted.train_input, context), context)
+    clouds = clouds_of(world.test, wanted.test_input, context)
+    labels, detections = detect(weights, clouds, context)
+    write_example(context.folder / "example.npz", clouds, labels, detections)
+    evaluation = scores.evaluation_of(labels, detections, world.rule)
+    resampling = Resampling(context.budget.resamples)
+    draws = scores.ap_draws(evaluation, resampling)
+    numbers = scores.ap_numbers(evaluation) | scores.where_lost(evaluation) | cloud_numbers(clouds)
+    return Outcome(numbers, intervals=scores.intervals_of(draws, resampling), draws=draws)
+
+
+def train_settings(recipe: DetectionRecipe, context: Context) -> TrainSettings:
+    """What `detection.train` is told: the same steps for every row of a table."""
+    from detection.augment import SceneAugmentation
+    from detection.optimiser import OneCycleSettings
+    from detection.train import TrainSettings
+
+    budget: DetectionBudget = context.budget
+    choice = detector_choice(recipe, budget)
+    options = {**choice.options, "features": [*choice.features, *recipe.train_input.extra_features]}
+    if choice.dense:
+        options[choice.dense] = recipe.train_input.settings.completed
+    scene = SceneAugmentation(rotation=0.785, scale=0.05, flip=0.5) if budget.augmented else None
+    every = max(1, min(50, budget.steps))
+    return TrainSettings(
+        preset=choice.preset,
+        options=options,
+        steps=budget.steps,
+        batch_size=budget.batch,
+        seed=context.seed,
+        optimiser=OneCycleSettings(peak=budget.peak),
+        scene=scene,
+        save_every=every,
+        log_every=every,
+    )
+
+
+def train_detector(recipe: DetectionRecipe, clouds: CloudCache, context: Context) -> Path:
+    """Weights trained from the beginning or from the last saved state.
+
+    They lie in OUT/data/trained-HASH: runs that differ only in their test clouds share them.
+    """
+    from detection.train import train
+
+    settings = train_settings(recipe, context)
+    record = [plain(settings), recipe.train_input.record(), clouds.folder.name, len(clouds)]
+    weights = context.out / "data" / f"trained-{short_hash(record)}" / "model.safetensors"
+    if weights.is_file():
+        return weights
+
+    def report(progress: TrainProgress) -> None:
+        text = f"step {progress.step} of {progress.steps}, loss {progress.losses['loss']:.2f}"
+        context.say(f"  {text}, {progress.seconds_per_step:.2f} s per step")
+
+    return train(settings, clouds, weights.parent, progress=report)
+
+
+def detect(
+    weights: Path, clouds: CloudCache, context: Context
+) -> tuple[dict[str, list[KittiObject]], dict[str, list[KittiObject]]]:
+    """Labels and detections of the test frames by id; those that are there already are read."""
+    from detection.infer import load_detector
+    from detection.results import result_objects
+
+    detector = load_detector(weights, seed=context.seed)
+    run_folder = RunFolder(context.folder)
+    labels, found = {}, {}
+    for frame in clouds.dataset:
+        files = FrameFiles(run_folder, frame.id)
+        if not run_folder.detections(frame.id).is_file():
+            cloud = clouds.point_frame(frame)
+            files.write_detections(result_objects(detector.detect(cloud), cloud))
+        labels[frame.id], found[frame.id] = frame.labels, files.read_detections()
+    return labels, found
+
+
+def cloud_numbers(clouds: CloudCache) -> dict[str, float]:
+    """Mean points of the test clouds, and percent of each kind and on objects among points whose truth is known."""
+    kinds, objects, points = np.zeros(len(LABELS)), 0.0, 0.0
+    for frame_id in clouds.dataset.ids:
+        cloud = clouds.read(frame_id)
+        kinds += np.bincount(cloud.kind, minlength=len(LABELS))
+        objects += float(cloud.objects[cloud.kind > 0].sum())
+        points += len(cloud.points)
+    known = max(float(kinds[1:].sum()), 1.0)
+    numbers = {f"cloud/{name} %": 100 * float(count) / known for name, count in zip(LABELS[1:], kinds[1:])}
+    return {**numbers, "cloud/object %": 100 * objects / known, "cloud/points": points / max(len(clouds), 1)}
