@@ -62,7 +62,7 @@ _RAW = ("intensity",)
 
 
 def _small(points: int, width: float, seconds: float) -> DetectorChoice:
-    return DetectorChoice("small", {"points": points, "width": width}, _POINT, "", seconds)
+    return DetectorChoice("small", {"points": points, "width": width, "classes": ["Car"]}, _POINT, "", seconds)
 
 
 def _voxel(preset: str, options: Mapping[str, Any], seconds: float) -> DetectorChoice:
