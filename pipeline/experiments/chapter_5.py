@@ -17,6 +17,14 @@ AP_COLUMNS = (
 # The column in which claims are judged.
 JUDGED = "bev_0.5_moderate"
 
+# The reasons that table "lost" shows; `detection.evaluation.explain` knows some more.
+REASONS = (
+    "label missed: no detection overlaps",
+    "label missed: IoU too low",
+    "detection false positive: nothing there",
+    "detection false positive: IoU too low",
+)
+
 NOTES = (
     "AP R40 of Car; IoU 0.7 as in the thesis, and IoU 0.5, in which the order of the rows is judged: detectors trained "
     "for so few steps place boxes too coarsely for 0.7",

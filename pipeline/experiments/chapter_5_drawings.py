@@ -32,7 +32,8 @@ def draw_fps(result: TableResult, figure: Any) -> None:
             values = [outcomes[0].numbers.get(f"{view}/{column.key}", np.nan) for view in _FPS_VIEWS]
             axis.plot(range(len(values)), values, f"{marker}-", color=colour, label=FPS_INPUTS[preset])
         axis.set_xticks(range(len(_FPS_VIEWS)), list(_FPS_VIEWS.values()), rotation=40, ha="right", fontsize=8)
-        axis.set(title=f"{column.title}, % of points", ylim=(0, None))
+        axis.set_title(f"{column.title}, %", fontsize=10)
+        axis.set(ylim=(0, None))
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8)
 
@@ -75,7 +76,8 @@ def draw_counts(result: TableResult, figure: Any) -> None:
     right.bar(places, 100 - useful - noise, 0.5, bottom=useful + noise, color="#BBBBBB", label="background, no noise")
     right.set(ylabel="% of points", ylim=(0, 100))
     for axis in (left, right):
-        axis.set_xticks(places, [row.label.replace(", ", ",\n") for row in rows], fontsize=8)
+        names = [row.label.replace(", ", ",\n").replace(" and ", "\nand ") for row in rows]
+        axis.set_xticks(places, names, fontsize=8)
         axis.legend(fontsize=8)
 
 

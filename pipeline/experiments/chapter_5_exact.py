@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from pipeline.experiments.chapter_5 import AP_COLUMNS, NEEDS, NOTES, ap_table, claim, row
-from pipeline.experiments.tables import Recipe, Row, Table
+from pipeline.experiments.chapter_5 import AP_COLUMNS, NEEDS, NOTES, REASONS, ap_table, claim, lidar_recipe, row
+from pipeline.experiments.tables import HIGHER, Column, Recipe, Row, Table
 
 EXACT_NOTE = "true depth of every pixel, sampled like a LiDAR of R rows by 512 columns, or all of it on a 0.1 m grid"
 NOISE_NOTE = (
@@ -242,6 +242,38 @@ NOISE_ROWS = replace(
     notes=(*NOTES, "depth completed by the embedded network from 64 to 8 rows; its error is the noise"),
 )
 
+_LOST_COLUMNS = (
+    Column("recall_0.5_moderate", "found", "%", HIGHER),
+    *(
+        Column(f"lost/{reason}", reason.replace("detection false positive", "false box"), digits=0)
+        for reason in REASONS
+    ),
+    Column("0-30/bev_0.5_moderate", "BEV 0-30 m", "%", HIGHER),
+    Column("30-70/bev_0.5_moderate", "BEV 30-70 m", "%", HIGHER),
+    Column("cloud/noise-fg %", "points smeared on objects", "%"),
+    Column("cloud/noise-inbet %", "points between surfaces", "%"),
+    Column("cloud/noise-bg %", "wrong background points", "%"),
+    Column("cloud/object %", "points on objects", "%", HIGHER),
+)
+LOST = Table(
+    "lost",
+    "table",
+    "Noise laboratory: where AP is lost",
+    "are cars missed, or boxes placed badly, and what is wrong with the points?",
+    _LOST_COLUMNS,
+    (
+        *(Row(name, recipe=lidar_recipe(name)) for name in ("L", "D", "D_F", "D_SF", "L_D_SF", "L_D_SF_mask")),
+        Row("exact 64R", recipe=exact()),
+        Row("exact 64R, blur 2 px", recipe=exact(noise=BLUR)),
+        Row("exact 64R, misaligned a = 0.01", recipe=exact(noise=MISALIGNED)),
+    ),
+    notes=(
+        "moderate cars, seen from above, IoU 0.5, every detection admitted; sums over the test frames",
+        "kinds of points by `pipeline/pointcloud/taxonomy.py`, of the test clouds; measured points count as clean",
+    ),
+    needs=NEEDS,
+)
+
 TABLES: tuple[Table, ...] = (
     TABLE_5_7,
     TABLE_5_8,
@@ -251,4 +283,5 @@ TABLES: tuple[Table, ...] = (
     NOISE_PIXELS,
     NOISE_DETECTORS,
     NOISE_ROWS,
+    LOST,
 )

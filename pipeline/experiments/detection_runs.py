@@ -68,8 +68,9 @@ def cost(recipe: Recipe, budget: DetectionBudget) -> Cost:
     choice = detector_choice(DetectionRecipe.of(recipe.settings), budget)
     frames = budget.train_frames + budget.test_frames
     seconds = budget.steps * choice.seconds_per_step * budget.batch / 2 + budget.test_frames * choice.seconds_per_frame
-    clouds = 26.0 * budget.cloud_points * frames
-    return Cost(seconds + 0.15 * frames, clouds, budget.seconds_per_data_frame * frames, 5 * _MEGABYTE * frames)
+    # Clouds are shared by seeds and detectors: a table has some six kinds of them.
+    shared = (5 * _MEGABYTE + 6 * 26.0 * budget.cloud_points) * frames
+    return Cost(seconds + 0.15 * frames, 5 * _MEGABYTE, budget.seconds_per_data_frame * frames, shared)
 
 
 def detector_choice(recipe: DetectionRecipe, budget: DetectionBudget) -> DetectorChoice:

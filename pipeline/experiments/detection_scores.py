@@ -13,6 +13,7 @@ from detection.evaluation.explain import explain, sum_reasons
 from detection.evaluation.kitti_ap import Evaluation, found_share, prepare
 from detection.evaluation.protocol import EVERYWHERE, Range, Target
 from detection.kitti_format import KittiObject
+from pipeline.experiments.chapter_5 import REASONS
 
 Objects = Mapping[str, list[KittiObject]]
 
@@ -83,7 +84,7 @@ def intervals_of(draws: Mapping[str, Sequence[float]], resampling: Resampling) -
 def where_lost(evaluation: Evaluation) -> dict[str, float]:
     """Why cars are missed and boxes false (moderate, BEV IoU 0.5): "lost/label missed: IoU too low" -> number."""
     target = next(t for t in evaluation.targets if (t.metric, t.iou, t.range) == ("bev", 0.5, EVERYWHERE))
-    numbers: dict[str, float] = {}
+    numbers = dict.fromkeys((f"lost/{reason}" for reason in REASONS), 0.0)
     for side, status, reason, count in sum_reasons(explain(evaluation.matcher, target, 1)):
         if status in ("missed", "false positive", "matched"):
             numbers[f"lost/{side} {status}: {reason}"] = float(count)

@@ -20,6 +20,7 @@ from pipeline.experiments.outputs import markdown, write_outputs
 from pipeline.experiments.plan import Order, TableResult, carry_out, gather, make_plan
 from pipeline.experiments.runs import Outcome
 from pipeline.experiments.tables import Table
+from tests.pipeline.data.vkitti2_tree import write_tree
 
 SMOKE_TABLES = ("5.8", "5.9", "5.1", "5.3", "5.6", "5.7")
 
@@ -87,6 +88,21 @@ def test_two_runs_and_a_continued_one_are_equal(out: Path, tmp_path: Path) -> No
     carry_out(type(plan)(Order((table,), tmp_path / "a", "smoke", 1), one.runs), lambda text: None)
     assert files[0].read_bytes() == first
     assert json.loads(first)["draws"]["bev_0.5_moderate"]
+
+
+def test_virtual_kitti_2_is_split_and_scored_as_in_the_thesis(tmp_path: Path) -> None:
+    root = write_tree(write_tree(tmp_path / "vkitti", "Scene01", 1), "Scene20", 2)
+    table = chapter_5_exact.TABLE_5_9
+    label = "2D bounding box"
+    plan = make_plan(Order((table,), tmp_path / "out", "smoke", 1, root))
+    runs = {table.name: {label: plan.runs[table.name][label]}}
+    carry_out(type(plan)(plan.order, runs), lambda text: None)
+    folder = runs[table.name][label][0].folder(tmp_path / "out")
+    numbers = json.loads((folder / "result.json").read_text())["numbers"]
+    assert sorted(path.name for path in folder.glob("detections/Scene20/clone/*")) == ["Camera_0", "Camera_1"]
+    assert numbers["labels_easy"] == 2
+    assert numbers["cloud/clean %"] == 100
+    assert numbers["cloud/object %"] > 50
 
 
 def test_tables_hold_what_the_thesis_printed() -> None:
