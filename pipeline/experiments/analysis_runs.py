@@ -1,4 +1,4 @@
-"""Runs without a network: expected losses, the filter over a depth step, the audit of pseudo ground truth."""
+"""Runs without a network: expected losses, the filter over a depth step."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 # Where the seconds per step below were measured; another machine needs another time, not other results.
-MACHINE = "one core of a 2-core Xeon server (2.6 GHz), torch 2.13, process time"
+MACHINE = "process time on one core of a 2-core server that was busy with other work, November 2026"
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,9 @@ class CompletionBudget:
     init, rgb    initialisation and colour scaling; published: "xavier", "unit" (see docs/completion.md)
     steps        optimiser steps; batch: crops of a step
     schedule     "cosine", or "halving" every sixth of the run (published)
-    seconds_per_step   measured on MACHINE, by network
+    seconds_per_step, seconds_per_test_frame   on MACHINE, by network; seconds_per_data_frame: of making a frame
+
+    Times are no part of what a run depends on: `settings_of` leaves them out.
     """
 
     train_frames: int
@@ -43,13 +45,37 @@ class CompletionBudget:
     data_seed: int = 40
     seconds_per_step: Mapping[str, float] = field(default_factory=dict)
     seconds_per_test_frame: Mapping[str, float] = field(default_factory=dict)
-    seconds_per_data_frame: float = 6.0
+    seconds_per_data_frame: float = 0.0
 
+
+# Process time of a step and of scoring a test frame, by network; "paper" is scaled from "small" by operations.
+_SMOKE = (
+    {"multistack": 0.05, "resnet18": 0.1, "resnet18 dc": 0.1},
+    {"multistack": 0.2, "resnet18": 0.2, "resnet18 dc": 0.3},
+)
+_SMALL = (
+    {"multistack": 0.1, "resnet18": 0.11, "resnet18 dc": 0.15},
+    {"multistack": 0.3, "resnet18": 0.25, "resnet18 dc": 0.5},
+)
+_PAPER = (
+    {"multistack": 140.0, "resnet18": 350.0, "resnet18 dc": 400.0},
+    {"multistack": 12.0, "resnet18": 30.0, "resnet18 dc": 60.0},
+)
 
 COMPLETION: dict[str, CompletionBudget] = {
-    "smoke": CompletionBudget(2, 2, (96, 320), (64, 96), 0, 0, 4, 8, 20, 2, 1, 1e-3),
-    "small": CompletionBudget(200, 60, (188, 620), (96, 192), 144, 320, 8, 8, 40, 400, 2, 3e-3),
-    "paper": CompletionBudget(
-        5000, 420, None, (256, 1216), 256, 1216, 64, 64, 80, 105_000, 4, 1e-3, "xavier", "unit", "halving"
+    "smoke": CompletionBudget(
+        train_frames=2, test_frames=2, size=(96, 320), crop=(64, 96), test_rows=0, test_columns=0, channels=4,
+        resnet_width=8, bins=20, steps=2, batch=1, learning_rate=1e-3, seconds_per_step=_SMOKE[0],
+        seconds_per_test_frame=_SMOKE[1], seconds_per_data_frame=1.0,
     ),
-}
+    "small": CompletionBudget(
+        train_frames=72, test_frames=24, size=(188, 620), crop=(96, 192), test_rows=144, test_columns=384, channels=8,
+        resnet_width=8, bins=40, steps=240, batch=1, learning_rate=3e-3, seconds_per_step=_SMALL[0],
+        seconds_per_test_frame=_SMALL[1], seconds_per_data_frame=2.0,
+    ),
+    "paper": CompletionBudget(
+        train_frames=5000, test_frames=420, size=None, crop=(256, 1216), test_rows=256, test_columns=1216, channels=64,
+        resnet_width=64, bins=80, steps=105_000, batch=4, learning_rate=1e-3, init="xavier", rgb="unit",
+        schedule="halving", seconds_per_step=_PAPER[0], seconds_per_test_frame=_PAPER[1], seconds_per_data_frame=12.0,
+    ),
+}  # fmt: skip

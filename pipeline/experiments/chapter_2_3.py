@@ -162,7 +162,7 @@ TABLE_3_2 = Table(
 )
 
 _SQUARE = (
-    ("depth in, MSE", "resnet18", "l2", (6.63, 15.28, 5.96, 6.97), ""),
+    ("depth in, MSE", "resnet18_plain", "l2", (6.63, 15.28, 5.96, 6.97), ""),
     ("DC in, MSE", "resnet18_dc_input", "l2", (6.10, 15.32, 5.72, 6.73), ""),
     ("depth in, CE", "resnet18_depth_input", "dc", (9.53, 17.81, 6.75, 7.56), "all"),
     ("DC in, CE", "resnet18", "dc", (3.82, 11.85, 4.24, 5.37), "all"),

@@ -1,4 +1,4 @@
-"""TWISE against MultiStack pixel by pixel (Eq. 4.9, 4.10; Fig. 4.7, 4.8): two finished runs on the same test frames."""
+"""Pixel by pixel: TWISE against MultiStack (Eq. 4.9, 4.10; Fig. 4.7, 4.8), and semi-dense ground truth (Table 4.3)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from pipeline.experiments.chapter_2_3 import training
 from pipeline.experiments.completion_runs import default_read_out, load_weights, model_spec, test_frame
 from pipeline.experiments.runs import Context, Outcome, do_run, plan_run
 from pipeline.experiments.tables import Recipe
-from pipeline.runner.atomic import write_bytes
 
 LEVELS = (0.0, 0.01, 0.1, 1.0)
 Depth = NDArray[np.float32]
@@ -55,17 +54,9 @@ def compare(recipe: Recipe, context: Context) -> Outcome:
         for name, value in _shares(absolute, edge_mask(target)).items():
             frames.setdefault(name, []).append(value)
     arrays: dict[str, Any] = {"absolute": np.stack(absolute_maps[:8]), "squared": np.stack(squared_maps[:8])}
-    write_bytes(context.folder / "maps.npz", _npz(arrays))
+    stored.write_npz(context.folder / "maps.npz", arrays)
     means = {name: float(np.nanmean(values)) for name, values in frames.items()}
     return Outcome(means | _histogram_numbers(absolute_maps), frames)
-
-
-def _npz(arrays: dict[str, Any]) -> bytes:
-    import io
-
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
-    return buffer.getvalue()
 
 
 def _shares(absolute: Depth, edges: NDArray[np.bool_]) -> dict[str, float]:
@@ -87,4 +78,46 @@ def _histogram_numbers(maps: Sequence[Depth]) -> dict[str, float]:
     return {
         "mean_gain_mm": 1000 * float(better.mean()) if len(better) else 0.0,
         "mean_loss_mm": 1000 * float(worse.mean()) if len(worse) else 0.0,
+    }
+
+
+FOCAL_BASELINE = 721.5377 * 0.532725  # pixels x metres of KITTI's cameras: depth 10 m is 38.4 px of disparity
+
+
+def audit(context: Context) -> Outcome:
+    """The error of pseudo ground truth against the exact depth (Table 4.3), over the test frames that have any.
+
+    disparity_mae_px, disparity_rmse_px   at KITTI's focal length and baseline; outliers_percent: more than 3 px and 5 %
+    gt_mae_mm, gt_rmse_mm                 of depth
+    density_percent                       pixels with a value, of the pixels a LiDAR measures
+    edge_error_percent, edge_pixels_percent   share of the summed error, and of the pixels, at depth edges
+    """
+    _, paths = stored.ensure_frames(context.out, context.data, context.budget, context.say, ("test",))
+    frames: dict[str, list[float]] = {}
+    for path in paths:
+        frame = stored.load(path)
+        if frame.semi_dense is not None and (frame.semi_dense > 0).any():
+            for name, value in audit_frame(frame.semi_dense, frame.clean).items():
+                frames.setdefault(name, []).append(value)
+    return Outcome({name: float(np.mean(values)) for name, values in frames.items()}, frames)
+
+
+def audit_frame(semi_dense: Depth, clean: Depth) -> dict[str, float]:
+    """`audit` of one frame."""
+    from completion.diagnostics import edge_mask
+
+    valid = (semi_dense > 0) & (clean > 0)
+    noisy, exact = semi_dense[valid].astype(np.float64), clean[valid].astype(np.float64)
+    error = np.abs(noisy - exact)
+    disparity, shift = FOCAL_BASELINE / exact, np.abs(FOCAL_BASELINE / noisy - FOCAL_BASELINE / exact)
+    edges = edge_mask(clean)[valid]
+    return {
+        "disparity_mae_px": float(shift.mean()),
+        "disparity_rmse_px": float(np.sqrt((shift**2).mean())),
+        "outliers_percent": 100 * float(((shift > 3) & (shift > 0.05 * disparity)).mean()),
+        "gt_mae_mm": 1000 * float(error.mean()),
+        "gt_rmse_mm": 1000 * float(np.sqrt((error**2).mean())),
+        "density_percent": 100 * float(valid.sum() / max(1, int((clean > 0).sum()))),
+        "edge_error_percent": 100 * float(error[edges].sum() / max(1e-9, error.sum())),
+        "edge_pixels_percent": 100 * float(edges.mean()),
     }

@@ -2,7 +2,7 @@
 
 Settings of a recipe: network, loss, gamma, rows (64, 32, 16, 8, 0 = monocular), colour, target ("clean" or
 "semi_dense": what it is trained on), scene ("street", or "samples_500": random samples in place of LiDAR rows); or
-compare: two "network loss" names whose pixel errors are compared.
+compare: two "network loss" names whose pixel errors are compared; or audit: the semi-dense ground truth is measured.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ def cost(recipe: Recipe, budget: CompletionBudget) -> Cost:
     """Steps and test frames by the measured seconds of the network; data once."""
     frames = budget.train_frames + budget.test_frames
     once = {"data_seconds": frames * budget.seconds_per_data_frame, "data_bytes": frames * 13.0 * _pixels(budget)}
-    if "compare" in recipe.settings:
-        return Cost(budget.test_frames * 0.2, 1e4, **once)
+    if "network" not in recipe.settings:
+        return Cost(budget.test_frames * 0.2, 1e6, **once)
     name = cost_name(recipe)
     train, test = budget.seconds_per_step.get(name, 0.0), budget.seconds_per_test_frame.get(name, 0.0)
     return Cost(budget.steps * train + budget.test_frames * test, 5e6 * (budget.channels / 16) ** 2, **once)
@@ -77,16 +77,22 @@ def run(recipe: Recipe, context: Context) -> Outcome:
         from pipeline.experiments.comparison import compare
 
         return compare(recipe, context)
+    if "audit" in recipe.settings:
+        from pipeline.experiments.comparison import audit
+
+        return audit(context)
     from completion.infer import NetworkCompleter
-    from pipeline.experiments.scoring import score
+    from pipeline.experiments.scoring import save_examples, score
 
     _check(recipe, context.budget)
-    train_paths, test_paths = stored.ensure_frames(context.out, context.data, context.budget, context.say)
+    noisy = ("train", "test") if recipe.settings["target"] == "semi_dense" else ()
+    train_paths, test_paths = stored.ensure_frames(context.out, context.data, context.budget, context.say, noisy)
     settings = train_settings(recipe, context.budget, context.seed)
     weights = _train(settings, _Samples(recipe, train_paths), context)
     model = load_weights(settings.model, weights)
     tests = [test_frame(recipe, path) for path in test_paths]
     completer = NetworkCompleter(model, settings.model, read_out=default_read_out(settings.model))
+    save_examples(context.folder, completer, tests)
     return score(completer, tests, settings.model, DIAGNOSED)
 
 
@@ -170,8 +176,13 @@ def load_weights(spec: ModelSpec, weights: Path) -> nn.Module:
     return model
 
 
-@lru_cache(maxsize=512)
 def _load(path: Path) -> StoredFrame:
+    """A frame, from memory when it was read before (its second ground truth may be made later)."""
+    return _remembered(path, stored.semi_dense_file(path).is_file())
+
+
+@lru_cache(maxsize=512)
+def _remembered(path: Path, with_semi_dense: bool) -> StoredFrame:
     """Frames stay in memory over the runs of a table (about 1 MB each)."""
     return stored.load(path)
 
@@ -233,6 +244,8 @@ def random_samples(depth: NDArray[np.float32], rng: np.random.Generator, count: 
 def test_frame(recipe: Recipe, path: Path) -> StoredFrame:
     """A test frame whose 64-row map and image are what the recipe's network sees."""
     frame = _load(path)
+    if recipe.settings["target"] == "clean":
+        frame = replace(frame, semi_dense=None)  # so that a run's numbers do not depend on what else was made
     sparse = sparse_of(recipe, frame, path)
     if recipe.settings["scene"] == "samples_500":
         seed = int.from_bytes(path.stem.encode()[-6:], "big")

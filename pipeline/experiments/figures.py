@@ -140,12 +140,54 @@ def draw_expected_loss(result: TableResult, figure: Any) -> None:
             axes[1, column].axvline(x, color="grey", linewidth=0.8, linestyle=":")
 
 
+def draw_relative_errors(result: TableResult, figure: Any) -> None:
+    """Fig. 4.7 and 4.8: where TWISE is better (positive) in one test frame, and histograms over several."""
+    import numpy as np
+
+    from completion.analysis import relative_error_histograms
+
+    folder = result.folders[next(iter(result.outcomes))][0]
+    with np.load(folder / "maps.npz") as maps:
+        both = {"absolute error [m]": maps["absolute"], "squared error [m^2]": maps["squared"]}
+    axes = figure.subplots(2, 2)
+    for column, ((title, stack), limit) in enumerate(zip(both.items(), (2.0, 10.0))):
+        shown = axes[0, column].imshow(stack[0], cmap="PuOr_r", vmin=-limit, vmax=limit)
+        axes[0, column].set_title(f"difference of {title}: orange, TWISE better", fontsize=8)
+        axes[0, column].set_axis_off()
+        figure.colorbar(shown, ax=axes[0, column], shrink=0.8)
+        edges, better, worse = relative_error_histograms(list(stack))
+        axes[1, column].stairs(better, edges, color=THEIRS, label="TWISE better")
+        axes[1, column].stairs(worse, edges, color=OURS, label="TWISE worse")
+        axes[1, column].set(xscale="log", yscale="symlog", xlabel=f"|difference of {title}|", ylabel="pixels")
+        axes[1, column].legend(fontsize=7)
+
+
+def draw_error_maps(result: TableResult, figure: Any) -> None:
+    """Fig. 4.9: image above, absolute error from 0 to 5 m below, a line per network."""
+    import numpy as np
+
+    axes = figure.subplots(1 + len(result.outcomes), 2, squeeze=False)
+    for line, label in enumerate(result.outcomes, start=1):
+        with np.load(result.folders[label][0] / "examples.npz") as examples:
+            for column in range(2):
+                target = examples[f"clean_{column}"].astype(np.float32)
+                error = np.abs(examples[f"depth_{column}"].astype(np.float32) - target)
+                axes[0, column].imshow(examples[f"image_{column}"])
+                shown = axes[line, column].imshow(np.where(target > 0, error, np.nan), cmap="magma", vmin=0, vmax=5)
+                axes[line, column].set_title(label, fontsize=8)
+    for axis in axes.ravel():
+        axis.set_axis_off()
+    figure.colorbar(shown, ax=axes[1:], label="error [m]", shrink=0.8)
+
+
 DRAWINGS: dict[str, Callable[[TableResult, Any], None]] = {
     **chapter_5_drawings.DRAWINGS,
     "dots": draw_dots,
     "curve": draw_curve,
     "scatter": draw_scatter,
     "expected_loss": draw_expected_loss,
+    "relative_errors": draw_relative_errors,
+    "error_maps": draw_error_maps,
 }
 LEGENDS = {
     "dots": "blue dots: ours with 95 % interval; orange diamonds: thesis (upper axis)",

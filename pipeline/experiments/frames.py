@@ -1,7 +1,7 @@
 """Frames of the completion experiments: made or read once per experiment folder, kept small, held in memory.
 
-OUT/data/completion-KEY/{train,test}/ID.npz. Of every frame: the image, the sparse map at 64, 32, 16 and 8 rows, exact
-(clean) and semi-dense ground truth where a LiDAR measures, and which pixels belong to foreground objects.
+OUT/data/completion-KEY/{train,test}/ID.npz. Of every frame: the image, the sparse map at 64, 32, 16 and 8 rows, the
+exact depth where a LiDAR measures, and which pixels belong to foreground objects. ID.semi.npz: semi-dense ground truth.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,13 +21,16 @@ from numpy.typing import NDArray
 from pipeline.errors import UsageError
 from pipeline.experiments.budgets import CompletionBudget
 from pipeline.runner.atomic import write_bytes
+from pipeline.runner.keys import code_version
 
 if TYPE_CHECKING:
     from pipeline.data import Dataset
+    from pipeline.simulation.render import View
 
 ROWS = (64, 32, 16, 8)
 # Table 4.2: pole, wall, fence, traffic sign and light, person, vehicle (Cityscapes trainIds).
 FOREGROUND = (3, 4, 5, 6, 7, 11, 12, 13, 14, 15, 16, 17, 18)
+FIRST_TEST = 100_000  # streets of the test set; training counts from 0
 SCANS_ASIDE = 2  # the pseudo ground truth joins this many scans before and after (Uhrig et al.: 5)
 AZIMUTH_STEP = 0.36  # degrees; twice the usual step suits images of half the usual size
 
@@ -37,7 +40,7 @@ class StoredFrame:
     """Maps (H, W); depths float32 metres, 0 = none.
 
     sparse      by LiDAR rows; without points only 64
-    clean       exact depth, semi_dense: pseudo ground truth (None when the data set has only one kind: `clean`)
+    clean       the data set's truth (exact on the synthetic world); semi_dense: pseudo ground truth, None without it
     foreground  bool, None without class maps
     """
 
@@ -61,10 +64,13 @@ def store(frame: StoredFrame, path: Path) -> None:
     """Writes a frame atomically."""
     parts: dict[str, Any] = {"image": frame.image, "clean": _pack(frame.clean)}
     parts |= {f"sparse_{rows}": _pack(depth) for rows, depth in frame.sparse.items()}
-    if frame.semi_dense is not None:
-        parts["semi_dense"] = _pack(frame.semi_dense)
     if frame.foreground is not None:
         parts["foreground"] = frame.foreground
+    write_npz(path, parts)
+
+
+def write_npz(path: Path, parts: Mapping[str, Any]) -> None:
+    """Writes arrays atomically."""
     buffer = io.BytesIO()
     np.savez(buffer, **parts)
     write_bytes(path, buffer.getvalue())
@@ -74,20 +80,22 @@ def load(path: Path) -> StoredFrame:
     """Reads what `store` wrote."""
     with np.load(path) as parts:
         sparse = {rows: _unpack(parts[f"sparse_{rows}"]) for rows in ROWS if f"sparse_{rows}" in parts}
-        semi_dense = _unpack(parts["semi_dense"]) if "semi_dense" in parts else None
-        foreground = parts.get("foreground")
-        return StoredFrame(parts["image"], sparse, _unpack(parts["clean"]), semi_dense, foreground)
+        frame = StoredFrame(parts["image"], sparse, _unpack(parts["clean"]), None, parts.get("foreground"))
+    if not semi_dense_file(path).is_file():
+        return frame
+    with np.load(semi_dense_file(path)) as parts:
+        return replace(frame, semi_dense=_unpack(parts["semi_dense"]))
 
 
 def _fields(budget: CompletionBudget) -> dict[str, Any]:
-    names = ("train_frames", "test_frames", "size", "test_rows", "test_columns", "data_seed")
+    names = ("size", "test_rows", "test_columns", "data_seed")
     return {name: getattr(budget, name) for name in names}
 
 
 def identity(data: Path | None, budget: CompletionBudget) -> dict[str, Any]:
-    """What determines the frames: the budget's numbers, and the user's data set by name and ids."""
+    """What determines a frame: the budget's numbers, and the user's data set by name and ids."""
     if data is None:
-        return {"synthetic": _fields(budget)}
+        return {"synthetic": _fields(budget), "world": code_version("pipeline/simulation")}
     dataset = open_any(data)
     ids = hashlib.sha256("\n".join(dataset.ids).encode()).hexdigest()
     return {"name": dataset.name, "ids": ids, **_fields(budget)}
@@ -116,10 +124,20 @@ def folder_of(out: Path, data: Path | None, budget: CompletionBudget) -> Path:
 
 
 def ensure_frames(
-    out: Path, data: Path | None, budget: CompletionBudget, say: Callable[[str], None]
+    out: Path,
+    data: Path | None,
+    budget: CompletionBudget,
+    say: Callable[[str], None],
+    semi_dense: tuple[str, ...] = (),
 ) -> tuple[list[Path], list[Path]]:
-    """Training and test files; those that are missing are made (a killed preparation continues)."""
+    """Training and test files; those that are missing are made (a killed preparation continues).
+
+    semi_dense  splits ("train", "test") whose pseudo ground truth is made too, in ID.semi.npz beside ID.npz: it takes
+                twice the time of the rest
+    """
     folder = folder_of(out, data, budget)
+    if semi_dense and data is not None:
+        raise UsageError("semi-dense beside clean ground truth (figure 4.11) is made on the synthetic world only")
     makers = _synthetic(budget) if data is None else _read(open_any(data), budget)
     paths: dict[str, list[Path]] = {"train": [], "test": []}
     made = 0
@@ -129,31 +147,39 @@ def ensure_frames(
         if not path.is_file():
             store(_cut(make(), budget), path)
             made += 1
-            if made % 20 == 0:
-                say(f"  {made} frames made")
+        if split in semi_dense and not semi_dense_file(path).is_file():
+            noisy = simulate_semi_dense(budget, int(name))
+            write_npz(semi_dense_file(path), {"semi_dense": _pack(_area(noisy, budget))})
+            made += 1
+        if made and made % 20 == 0:
+            say(f"  {made} files of frames made")
     return paths["train"], paths["test"]
 
 
+def semi_dense_file(path: Path) -> Path:
+    """ID.semi.npz of ID.npz."""
+    return path.with_name(f"{path.stem}.semi.npz")
+
+
+def _area(values: Any, budget: CompletionBudget) -> Any:
+    """The bottom rows and centred columns that the budget uses."""
+    height, width = values.shape[:2]
+    top = max(0, height - budget.test_rows) if budget.test_rows else 0
+    left = max(0, width - budget.test_columns) // 2 if budget.test_columns else 0
+    return values[top:, left : left + (budget.test_columns or width)]
+
+
 def _cut(frame: StoredFrame, budget: CompletionBudget) -> StoredFrame:
-    """The bottom rows and centred columns that the budget uses; truth only where the full scan says something."""
+    """The area that the budget uses; truth only where the full scan says something."""
     from completion.diagnostics import measured_region
     from completion.types import DepthFrame
 
-    def measured(target: NDArray[np.float32]) -> NDArray[np.float32]:
-        return measured_region(DepthFrame(frame.image, frame.sparse[64], target))
-
-    semi_dense = None if frame.semi_dense is None else measured(frame.semi_dense)
-    whole = replace(frame, clean=measured(frame.clean), semi_dense=semi_dense)
-    height, width = frame.clean.shape
-    top = max(0, height - budget.test_rows) if budget.test_rows else 0
-    left = max(0, width - budget.test_columns) // 2 if budget.test_columns else 0
-    area = (slice(top, None), slice(left, left + (budget.test_columns or width)))
+    clean = measured_region(DepthFrame(frame.image, frame.sparse[64], frame.clean))
     return StoredFrame(
-        whole.image[area],
-        {rows: depth[area] for rows, depth in whole.sparse.items()},
-        whole.clean[area],
-        None if whole.semi_dense is None else whole.semi_dense[area],
-        None if whole.foreground is None else whole.foreground[area],
+        _area(frame.image, budget),
+        {rows: _area(depth, budget) for rows, depth in frame.sparse.items()},
+        _area(clean, budget),
+        foreground=None if frame.foreground is None else _area(frame.foreground, budget),
     )
 
 
@@ -161,49 +187,88 @@ Maker = tuple[str, str, Callable[[], StoredFrame]]
 
 
 def _synthetic(budget: CompletionBudget) -> Iterator[Maker]:
-    for index in range(budget.train_frames + budget.test_frames):
-        split = "train" if index < budget.train_frames else "test"
-        yield split, f"{index:06d}", partial(simulate, budget, index)
+    for split, first, count in (("train", 0, budget.train_frames), ("test", FIRST_TEST, budget.test_frames)):
+        for index in range(first, first + count):
+            yield split, f"{index:06d}", partial(simulate, budget, index)
 
 
 def simulate(budget: CompletionBudget, index: int) -> StoredFrame:
-    """Street `index` of the synthetic world with clean depth and pseudo ground truth."""
+    """Street `index` of the synthetic world with clean depth."""
     from pipeline.data.projection import project_points
-    from pipeline.simulation.lidar import scan, sensor
     from pipeline.simulation.lidar_rows import split_rings
-    from pipeline.simulation.render import render
-    from pipeline.simulation.rig import LIDAR_HEIGHT, draw_rig
-    from pipeline.simulation.scenes.layouts import draw_scene
-    from pipeline.simulation.semi_dense import semi_dense, stereo_depth
-    from pipeline.simulation.sequence import FRAME_PERIOD
-    from pipeline.simulation.synth import SynthSettings, frame_rng
-    from pipeline.simulation.tracing import Tracer
 
-    settings = SynthSettings(seed=budget.data_seed, size=budget.size)
-    scene = draw_scene(frame_rng(settings, index, 0), settings.streets)
-    scene = replace(scene, ego=replace(scene.ego, speed=min(scene.ego.speed, 12.0)))
-    calibration, size = draw_rig(frame_rng(settings, index, 1), settings.size)
-    beams = sensor(64) if budget.size is None else replace(sensor(64), azimuth_step=AZIMUTH_STEP)
-    scans, poses = [], []
-    for number in range(2 * SCANS_ASIDE + 1):
-        time = number * FRAME_PERIOD
-        tracer = Tracer(scene.triangles(time))
-        poses.append(np.asarray(scene.T_world_velo(time, LIDAR_HEIGHT), np.float64))
-        scans.append(scan(tracer, beams, poses[-1], frame_rng(settings, index, 10 + number)))
-        if number == SCANS_ASIDE:
-            camera = frame_rng(settings, index, 2)
-            views = [
-                render(tracer, scene.light, matrix, poses[-1] @ calibration.T_velo_cam, size, camera)
-                for matrix in (calibration.P2, calibration.P3)
-                if matrix is not None
-            ]
-    left, right = views
-    stereo = stereo_depth(left.image, right.image, float(calibration.P2[0, 0]))
-    noisy = semi_dense(scans, poses, SCANS_ASIDE, stereo, calibration, frame_rng(settings, index, 7))
-    points = scans[SCANS_ASIDE]
+    street = Street(budget, index)
+    view = street.views(0)[0]
+    points = street.scan(0)
     ring = split_rings(points)
-    sparse = {rows: project_points(points[ring % (64 // rows) == 0], calibration, size) for rows in ROWS}
-    return StoredFrame(left.image, sparse, left.depth, noisy, np.isin(left.semantics, FOREGROUND))
+    size = view.depth.shape
+    sparse = {rows: project_points(points[ring % (64 // rows) == 0], street.calibration, size) for rows in ROWS}
+    return StoredFrame(view.image, sparse, view.depth, None, np.isin(view.semantics, FOREGROUND))
+
+
+def simulate_semi_dense(budget: CompletionBudget, index: int) -> NDArray[np.float32]:
+    """Pseudo ground truth of the same moment: joined scans with pose errors, checked by stereo."""
+    from pipeline.simulation.semi_dense import semi_dense, stereo_depth
+
+    street = Street(budget, index)
+    numbers = range(-SCANS_ASIDE, SCANS_ASIDE + 1)
+    left, right = street.views(0, stereo=True)
+    stereo = stereo_depth(left.image, right.image, float(street.calibration.P2[0, 0]))
+    scans, poses = [street.scan(number) for number in numbers], [street.pose(number) for number in numbers]
+    return semi_dense(scans, poses, SCANS_ASIDE, stereo, street.calibration, street.rng(7))
+
+
+class Street:
+    """A street of the synthetic world at moments 0.1 s apart, number 0 being the frame's."""
+
+    def __init__(self, budget: CompletionBudget, index: int) -> None:
+        from pipeline.simulation.lidar import sensor
+        from pipeline.simulation.rig import draw_rig
+        from pipeline.simulation.scenes.layouts import draw_scene
+        from pipeline.simulation.synth import SynthSettings
+
+        self.settings, self.index = SynthSettings(seed=budget.data_seed, size=budget.size), index
+        scene = draw_scene(self.rng(0), self.settings.streets)
+        self.scene = replace(scene, ego=replace(scene.ego, speed=min(scene.ego.speed, 12.0)))
+        self.calibration, self.size = draw_rig(self.rng(1), budget.size)
+        self.beams = sensor(64) if budget.size is None else replace(sensor(64), azimuth_step=AZIMUTH_STEP)
+
+    def rng(self, purpose: int) -> np.random.Generator:
+        """Random numbers of one purpose."""
+        from pipeline.simulation.synth import frame_rng
+
+        return frame_rng(self.settings, self.index, purpose)
+
+    def time(self, number: int) -> float:
+        """Seconds since the street's beginning."""
+        from pipeline.simulation.sequence import FRAME_PERIOD
+
+        return (number + SCANS_ASIDE) * FRAME_PERIOD
+
+    def pose(self, number: int) -> NDArray[np.float64]:
+        """T_world_velo, (4, 4)."""
+        from pipeline.simulation.rig import LIDAR_HEIGHT
+
+        return np.asarray(self.scene.T_world_velo(self.time(number), LIDAR_HEIGHT), np.float64)
+
+    def scan(self, number: int) -> NDArray[np.float32]:
+        """(N, 4) points of one turn."""
+        from pipeline.simulation.lidar import scan
+        from pipeline.simulation.tracing import Tracer
+
+        tracer = Tracer(self.scene.triangles(self.time(number)))
+        return scan(tracer, self.beams, self.pose(number), self.rng(10 + SCANS_ASIDE + number))
+
+    def views(self, number: int, stereo: bool = False) -> list[View]:
+        """What camera 2 sees, and camera 3 with `stereo`."""
+        from pipeline.simulation.render import render
+        from pipeline.simulation.tracing import Tracer
+
+        tracer = Tracer(self.scene.triangles(self.time(number)))
+        T_world_cam = self.pose(number) @ self.calibration.T_velo_cam
+        matrices = [self.calibration.P2, self.calibration.P3] if stereo else [self.calibration.P2]
+        rng = self.rng(2)
+        return [render(tracer, self.scene.light, P, T_world_cam, self.size, rng) for P in matrices if P is not None]
 
 
 def _read(dataset: Dataset, budget: CompletionBudget) -> Iterator[Maker]:

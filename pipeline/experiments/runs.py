@@ -130,13 +130,18 @@ class Run:
         return out / "runs" / self.key
 
 
+def settings_of(budget: Any) -> dict[str, Any]:
+    """A budget as plain values without its measured times ("seconds_..."), on which no result depends."""
+    return {name: value for name, value in plain(budget).items() if not name.startswith("seconds_")}
+
+
 def plan_run(recipe: Recipe, budget: Any, data: Path | None, seed: int) -> Run:
     """The run of a recipe: its key is a hash of settings, budget, data and seed."""
     module = kind_module(recipe.kind)
     record = {
         "kind": recipe.kind,
         "settings": plain(recipe.settings),
-        "budget": plain(budget),
+        "budget": settings_of(budget),
         "data": module.data_identity(data, budget),
         "seed": seed,
     }
@@ -188,7 +193,7 @@ def do_run(run: Run, out: Path, data: Path | None, say: Callable[[str], None] = 
     record = {
         "kind": run.recipe.kind,
         "settings": plain(run.recipe.settings),
-        "budget": plain(run.budget),
+        "budget": settings_of(run.budget),
         "seed": run.seed,
         "numbers": {name: _plain_number(value) for name, value in sorted(outcome.numbers.items())},
         "frames": {name: [_plain_number(v) for v in values] for name, values in sorted(outcome.frames.items())},

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.experiments.frames import StoredFrame
+from pipeline.experiments.frames import StoredFrame, write_npz
 from pipeline.experiments.runs import Outcome
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from completion.types import CompletedDepth, DepthFrame
 
 Depth = NDArray[np.float32]
+EXAMPLES = 2
 # Kept per frame too, for intervals of a single seed.
 PER_FRAME = ("mae_mm", "rmse_mm", "tmae_mm", "trmse_mm", "mixed_percent", "edge_tmae_mm")
 
@@ -100,6 +102,16 @@ def score(completer: NetworkCompleter, frames: Sequence[StoredFrame], spec: Mode
     numbers |= {f"alive/{name}": value for name, value in diagnose(completer, some).items()}
     kept = {name: values for name, values in columns.items() if name.rpartition("/")[2] in PER_FRAME}
     return Outcome(numbers, {name: _padded(values, len(frames)) for name, values in kept.items()})
+
+
+def save_examples(folder: Path, completer: NetworkCompleter, frames: Sequence[StoredFrame]) -> None:
+    """examples.npz: image, depth and truth of the first test frames, for figures."""
+    parts: dict[str, NDArray[np.generic]] = {}
+    for number, frame in enumerate(frames[:EXAMPLES]):
+        parts[f"image_{number}"] = frame.image
+        parts[f"depth_{number}"] = completer.complete(frame.sparse[64], frame.image).depth.astype(np.float16)
+        parts[f"clean_{number}"] = frame.clean.astype(np.float16)
+    write_npz(folder / "examples.npz", parts)
 
 
 def _mean(values: Sequence[float]) -> float:
