@@ -100,18 +100,21 @@ def _project_rows(depth, top, slope_u, slope_v, R, origin, block):  # type: igno
     for row in range(rows):
         for axis in range(3):
             across, along = R[axis, 0], R[axis, 1] * slope_v[top + row] + R[axis, 2]
+            z, out, start = depth[top + row], block[axis, row * width : (row + 1) * width], origin[axis]
             for column in range(width):
-                direction = across * slope_u[column] + along
-                block[axis, row * width + column] = depth[top + row, column] * direction + origin[axis]
+                out[column] = z[column] * (across * slope_u[column] + along) + start
     return rows
 
 
 @njit(cache=True, nogil=True)
 def _project_pixels(depth, pixels, slope_u, slope_v, R, origin, points):  # type: ignore[no-untyped-def]
     width = depth.shape[1]
+    per_pixel = 1.0 / width
+    flat = depth.reshape(-1)
     for i in range(pixels.size):
-        row = pixels[i] // width
-        column = pixels[i] - row * width
-        for axis in range(3):
-            direction = R[axis, 0] * slope_u[column] + (R[axis, 1] * slope_v[row] + R[axis, 2])
-            points[i, axis] = depth[row, column] * direction + origin[axis]
+        # A product instead of a division; half a pixel keeps it clear of the rows' ends.
+        row = np.int64((pixels[i] + 0.5) * per_pixel)
+        z, u, v = np.float64(flat[pixels[i]]), slope_u[pixels[i] - row * width], slope_v[row]
+        points[i, 0] = z * (R[0, 0] * u + (R[0, 1] * v + R[0, 2])) + origin[0]
+        points[i, 1] = z * (R[1, 0] * u + (R[1, 1] * v + R[1, 2])) + origin[1]
+        points[i, 2] = z * (R[2, 0] * u + (R[2, 1] * v + R[2, 2])) + origin[2]

@@ -1,7 +1,7 @@
 """Back-projection and grid sampling in one go, block by block of image rows.
 
 The result is that of `back_project` followed by `grid_sampling`, bit for bit (a test compares them); the full cloud of
-some 400,000 points, which only its 30,000 representatives survive, is never written to memory.
+some 400,000 points, which only its 30,000 representatives survive, is kept only for the centroids.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.calibration import Calibration
 from pipeline.pointcloud.backproject import PixelRays, usable_pixels
-from pipeline.pointcloud.cells import CellBuilder, Cells
+from pipeline.pointcloud.cells import CellBuilder
 from pipeline.pointcloud.clouds import DenseCloud
 from pipeline.pointcloud.grid_sampling import GridSampling, add_block, first_of_cells, nearest_in_block, settle
 
@@ -39,47 +39,39 @@ def back_project_and_sample(
     """
     depth, kept = usable_pixels(depth, keep)
     rays = PixelRays.of(calibration, (depth.shape[0], depth.shape[1]))
-    cells, sums, runs_of_block = _cells_and_sums(depth, kept.reshape(-1), rays, grid)
+    builder = CellBuilder(1.0 / grid.size, "grid sampling")
+    builder.check(rays.reach(depth))
+    blocks = []
+    for block in _blocks(depth, rays, stay=grid.representative != "first"):
+        builder.add(block.points, block.first, kept.reshape(-1))
+        blocks.append(block)
+    cells = builder.cells()
     if grid.representative == "first":
         pixels = first_of_cells(cells).astype(np.int32)
         return DenseCloud(rays.project_pixels(depth, pixels), pixels)
-    sums[:, :3] /= sums[:, 3:]
-    if grid.representative == "centroid":
-        return DenseCloud(sums[:, :3].astype(np.float32), first_of_cells(cells).astype(np.int32))
-    sums[:, 3] = np.inf
-    pixels = np.zeros(len(cells), np.int32)
-    for block, runs in zip(_blocks(depth, rays), runs_of_block):
+    centroids = np.zeros((len(cells), 4))
+    for block, runs in zip(blocks, builder.block_runs, strict=True):
         settle(block.points)
-        nearest_in_block(block.points, block.first, cells, runs, sums, pixels)
+        add_block(block.points, block.first, cells, runs, centroids)
+    centroids[:, :3] /= centroids[:, 3:]
+    if grid.representative == "centroid":
+        return DenseCloud(centroids[:, :3].astype(np.float32), first_of_cells(cells).astype(np.int32))
+    centroids[:, 3] = np.inf
+    pixels = np.zeros(len(cells), np.int32)
+    for block, runs in zip(blocks, builder.block_runs, strict=True):
+        nearest_in_block(block.points, block.first, cells, runs, centroids, pixels)
     return DenseCloud(rays.project_pixels(depth, pixels), pixels)
 
 
-def _blocks(depth: NDArray[np.float32], rays: PixelRays) -> Iterator[_Block]:
-    """The points of all pixels, some rows at a time; the memory of a block is used again by the next."""
+def _blocks(depth: NDArray[np.float32], rays: PixelRays, stay: bool) -> Iterator[_Block]:
+    """The points of all pixels, some rows at a time; unless they are to stay, the next block takes their memory."""
     height, width = depth.shape
     if not depth.size:
         return
-    memory = np.empty((3, max(1, _BLOCK_PIXELS // width) * width), np.float32)
-    top = 0
-    while top < height:
-        rows = rays.project_rows(depth, top, memory)
-        yield _Block(memory[:, : rows * width], top * width)
-        top += rows
-
-
-def _cells_and_sums(
-    depth: NDArray[np.float32], kept: NDArray[np.bool_], rays: PixelRays, grid: GridSampling
-) -> tuple[Cells, NDArray[np.float64], list[tuple[int, int]]]:
-    """Occupied cells of the kept pixels, (M, 4) sums of x, y, z and count (zero for "first"), and each block's runs."""
-    builder = CellBuilder(depth.size, 1.0 / grid.size, "grid sampling")
-    builder.check(rays.reach(depth))
-    sums, runs_of_block = np.zeros((len(builder.keys), 4)), []
-    for block in _blocks(depth, rays):
-        runs = builder.add(block.points, block.first, kept)
-        runs_of_block.append(runs)
-        if grid.representative != "first":
-            if len(sums) < builder.count:
-                sums = np.concatenate([sums, np.zeros((len(builder.keys) - len(sums), 4))])
-            settle(block.points)
-            add_block(block.points, block.first, builder.cells(), runs, sums)
-    return builder.cells(), sums[: builder.count], runs_of_block
+    rows_at_once = max(1, _BLOCK_PIXELS // width)
+    count = -(-height // rows_at_once)
+    memory = np.empty((count if stay else 1, 3, rows_at_once * width), np.float32)
+    for number in range(count):
+        block, top = memory[number if stay else 0], number * rows_at_once
+        rows = rays.project_rows(depth, top, block)
+        yield _Block(block[:, : rows * width], top * width)

@@ -124,40 +124,43 @@ def _first(run_start, run_cell, representatives):  # type: ignore[no-untyped-def
 def _settle(points):  # type: ignore[no-untyped-def]
     for axis in range(points.shape[0]):
         for i in range(points.shape[1]):
-            points[axis, i] = np.rint(points[axis, i] * np.float64(1 << 26)) * (1.0 / (1 << 26))
+            # Exact in float32: powers of two, and whole numbers below 2^23 where anything changes.
+            points[axis, i] = np.rint(points[axis, i] * np.float32(1 << 26)) * np.float32(1.0 / (1 << 26))
 
 
 @njit(cache=True, nogil=True)
 def _add_block(points, first, run_start, run_cell, runs, sums):  # type: ignore[no-untyped-def]
     count = points.shape[1]
     # Sums up to each point: a run's sum is the difference at its ends, without a loop of unforeseeable length.
-    upto = np.empty((count + 1, 3))
+    upto = np.empty((count + 1, 4))
     x, y, z = 0.0, 0.0, 0.0
     for i in range(count):
-        upto[i, 0], upto[i, 1], upto[i, 2] = x, y, z
+        upto[i, 0], upto[i, 1], upto[i, 2], upto[i, 3] = x, y, z, i
         x += points[0, i]
         y += points[1, i]
         z += points[2, i]
-    upto[count, 0], upto[count, 1], upto[count, 2] = x, y, z
-    for run in range(runs[0], runs[1]):
-        cell, start, end = run_cell[run], run_start[run] - first, run_start[run + 1] - first
-        if cell >= 0:
-            for axis in range(3):
-                sums[cell, axis] += upto[end, axis] - upto[start, axis]
-            sums[cell, 3] += end - start
+    upto[count, 0], upto[count, 1], upto[count, 2], upto[count, 3] = x, y, z, count
+    # Unsigned indices: numba looks whether a signed one is negative at every access.
+    for run in range(np.uint64(runs[0]), np.uint64(runs[1])):
+        start, end = np.uint64(run_start[run] - first), np.uint64(run_start[run + np.uint64(1)] - first)
+        if run_cell[run] >= 0:
+            cell = np.uint64(run_cell[run])
+            for column in range(4):
+                sums[cell, column] += upto[end, column] - upto[start, column]
 
 
 @njit(cache=True, nogil=True)
 def _nearest_in_block(points, first, run_start, run_cell, runs, centroids, nearest):  # type: ignore[no-untyped-def]
-    for run in range(runs[0], runs[1]):
-        cell = run_cell[run]
-        if cell >= 0:
+    for run in range(np.uint64(runs[0]), np.uint64(runs[1])):
+        if run_cell[run] >= 0:
+            cell = np.uint64(run_cell[run])
             x, y, z, smallest = centroids[cell, 0], centroids[cell, 1], centroids[cell, 2], centroids[cell, 3]
-            best = nearest[cell]
-            for i in range(run_start[run] - first, run_start[run + 1] - first):
+            best = np.int64(nearest[cell])
+            start, end = np.uint64(run_start[run] - first), np.uint64(run_start[run + np.uint64(1)] - first)
+            for i in range(start, end):
                 dx, dy, dz = points[0, i] - x, points[1, i] - y, points[2, i] - z
                 distance = dx * dx + dy * dy + dz * dz
                 nearer = distance < smallest
                 smallest = distance if nearer else smallest
-                best = first + i if nearer else best
+                best = first + np.int64(i) if nearer else best
             centroids[cell, 3], nearest[cell] = smallest, best
