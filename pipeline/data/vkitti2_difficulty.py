@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from detection.boxes import corners
+from detection.evaluation.difficulty import Vkitti2Difficulty, occlusion_from_fill
 from detection.types import Boxes3D
 from pipeline.data.vkitti2_text import VkittiObject, objects_of_folder, read_camera_rows
 from pipeline.errors import UsageError
@@ -36,16 +37,10 @@ def difficulty(height: float, truncation: float, occlusion: float) -> str:
     height      bottom - top of the 2D box in pixels
     truncation  truncation_ratio
     occlusion   fraction hidden, by one of the rules above
-    Thesis ch. 5: easy > 40 px, < 0.1, < 0.1; medium >= 20 px, <= 0.5, <= 0.6; hard >= 15 px, <= 0.9. The printed lower
-    limits of medium and hard would leave an unoccluded car of 30 px in no class; levels are cumulative as in KITTI.
+    The limits, and how the gaps between them are read, are those of the evaluation (`Vkitti2Difficulty`).
     """
-    if height > 40 and truncation < 0.1 and occlusion < 0.1:
-        return "easy"
-    if height >= 20 and truncation <= 0.5 and occlusion <= 0.6:
-        return "medium"
-    if height >= 15 and truncation <= 0.9:
-        return "hard"
-    return "ignored"
+    values = (np.array([value]) for value in (height, truncation, occlusion))
+    return LEVELS[int(Vkitti2Difficulty().level(*values)[0])]
 
 
 def occlusion_literal(item: VkittiObject) -> float:
@@ -55,7 +50,7 @@ def occlusion_literal(item: VkittiObject) -> float:
 
 def occlusion_by_fill(item: VkittiObject, fill: dict[str, float]) -> float:
     """1 - occupancy_ratio / fill of the label in full view (see `full_fill`)."""
-    return float(np.clip(1 - item.occupancy_ratio / fill.get(item.label, 1.0), 0, 1))
+    return float(occlusion_from_fill(np.array([item.occupancy_ratio]), fill.get(item.label, 1.0))[0])
 
 
 def occlusion_by_hull(item: VkittiObject, camera: tuple[float, ...], fill: dict[str, float]) -> float:
