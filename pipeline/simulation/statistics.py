@@ -1,7 +1,8 @@
 """How like KITTI the synthetic world is: the same figures from real and from synthetic frames, as a table and plots.
 
 Command:  python -m pipeline.simulation.statistics --real DIR --frames 200 --seed 0 --workers 2 --out docs/images
-writes synthetic_statistics.md and synthetic_statistics.png to the folder given by --out.
+writes synthetic_statistics.md and synthetic_statistics.png to the folder given by --out. With --synthetic DIR the first
+frames of a data set that `--stage synth` has written are described instead of simulating them again.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ class FrameStatistics:
     other             label counts of all other types
     intensity         quantiles 10, 50, 90 % of the intensity of points in view
     brightness        mean, standard deviation (0..255) and share of saturated pixels of the image
+    row_shares        points kept by 32, 16 and 8 rows of the scan, in percent above an even share of them
     edge_contrast, plain_contrast  median grey difference over 4 px across and away from depth edges
     """
 
@@ -47,6 +49,7 @@ class FrameStatistics:
     other: dict[str, int]
     intensity: NDArray[np.float64]
     brightness: tuple[float, float, float]
+    row_shares: tuple[float, float, float]
     edge_contrast: float
     plain_contrast: float
 
@@ -63,16 +66,19 @@ def describe(
     values = sparse[sparse > 0]
     grey = image.astype(np.float32).mean(axis=2)
     edge, plain = _contrast(points, pixels, depth, seen, grey)
+    ring = split_rings(points)
+    half, quarter, eighth = (100 * (step * float((ring % step == 0).mean()) - 1) for step in (2, 4, 8))
     return FrameStatistics(
         in_view=int(seen.sum()),
         in_scan=len(points),
         sparse_share=float((sparse > 0).mean()),
         depth_shares=np.histogram(values, DEPTH_EDGES)[0] / max(len(values), 1),
-        ring_returns=_ring_returns(points, seen),
+        ring_returns=_ring_returns(points, ring),
         cars=_cars(camera, labels),
         other=_count(item.type for item in labels),
         intensity=np.quantile(points[seen, 3], [0.1, 0.5, 0.9]),
         brightness=(float(grey.mean()), float(grey.std()), float((grey > 250).mean())),
+        row_shares=(half, quarter, eighth),
         edge_contrast=edge,
         plain_contrast=plain,
     )
@@ -104,9 +110,8 @@ def _cars(camera: NDArray[np.float64], labels: list[KittiObject]) -> NDArray[np.
     return np.array(rows, dtype=np.float64).reshape(-1, 8)
 
 
-def _ring_returns(points: NDArray[np.float32], seen: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _ring_returns(points: NDArray[np.float32], ring: NDArray[np.int64]) -> NDArray[np.float64]:
     """Points of each ring within 38 degrees of forward as a share of the pulses fired there."""
-    ring = split_rings(points)
     forward = np.abs(np.degrees(np.arctan2(points[:, 1], points[:, 0]))) < 38
     counts = np.bincount(ring[forward], minlength=64)[:64]
     return np.asarray(counts / (76 / 0.17))
@@ -132,11 +137,11 @@ def _contrast(
     return result[0], result[1]
 
 
-def describe_real(root: Path) -> list[FrameStatistics]:
-    """Figures of every frame of a KITTI object folder that has a scan, an image, a calibration and labels."""
+def describe_folder(root: Path, count: int | None = None) -> list[FrameStatistics]:
+    """Figures of the (first `count`) frames of a KITTI object folder, which has scans, images, calibration, labels."""
     from pipeline.data import open_dataset
 
-    frames = open_dataset("kitti_object", root)
+    frames = open_dataset("kitti_object", root).select(slice(0, count))
     return [describe(f.points, f.calibration, f.labels, f.image) for f in frames]
 
 
@@ -181,6 +186,10 @@ def summary(frames: list[FrameStatistics]) -> dict[str, str]:
         "saturated pixels, %": spread((100 * f.brightness[2] for f in frames), 1),
         "grey step across depth edges": spread((f.edge_contrast for f in frames), 1),
         "grey step elsewhere": spread((f.plain_contrast for f in frames), 1),
+        **{
+            f"points of {rows} rows, % above 1/{step} (worst)": f"{_mean_and_worst([f.row_shares[k] for f in frames])}"
+            for k, (rows, step) in enumerate(((32, 2), (16, 4), (8, 8)))
+        },
         "cars per frame (mean)": f"{len(cars) / len(frames):.1f}",
     }
     for low, high in ((0, 10), (10, 20), (20, 30), (30, 45), (45, 80)):
@@ -202,6 +211,11 @@ def summary(frames: list[FrameStatistics]) -> dict[str, str]:
         f"{sum(f.other.get(name, 0) for f in frames) / len(frames):.1f}" for name in names
     )
     return rows
+
+
+def _mean_and_worst(values: list[float]) -> str:
+    """The mean, and the value farthest from 0, as text."""
+    return f"{np.mean(values):+.1f} ({max(values, key=abs):+.1f})"
 
 
 def table(real: list[FrameStatistics], synthetic: list[FrameStatistics]) -> str:
@@ -245,12 +259,17 @@ def main(arguments: list[str] | None = None) -> int:
     """Command line; see the module's text."""
     parser = argparse.ArgumentParser(prog="python -m pipeline.simulation.statistics", description=__doc__)
     parser.add_argument("--real", type=Path, required=True, help="KITTI object folder with training/")
+    parser.add_argument("--synthetic", type=Path, default=None, help="KITTI object folder written by --stage synth")
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("docs/images"))
     options = parser.parse_args(arguments)
-    real, synthetic = describe_real(options.real), describe_synthetic(options.frames, options.seed, options.workers)
+    real = describe_folder(options.real)
+    if options.synthetic is not None:
+        synthetic = describe_folder(options.synthetic, options.frames)
+    else:
+        synthetic = describe_synthetic(options.frames, options.seed, options.workers)
     text = table(real, synthetic)
     plot(real, synthetic, options.out / "synthetic_statistics.png")
     (options.out / "synthetic_statistics.md").write_text(text, encoding="utf-8")

@@ -16,7 +16,7 @@ from pipeline.data.writers.kitti_depth import drives, pseudo_ground_truth
 from pipeline.data.writers.vkitti2 import scene_lengths
 from pipeline.simulation.semi_dense import PoseNoise, accumulate, consistent, stereo_depth
 from pipeline.simulation.sequence import simulate_sequence
-from pipeline.simulation.statistics import describe, plot, table
+from pipeline.simulation.statistics import describe, describe_folder, plot, table
 from pipeline.simulation.synth import SyntheticFrame, SynthSettings, simulate_frame, write_dataset
 
 
@@ -202,6 +202,16 @@ def test_stereo_depth_of_a_shifted_texture() -> None:
     # A disparity of 20 px at f = 400: 400 * 0.532725 / 20 = 10.65 m.
     depth = stereo_depth(left, right, 400.0)
     assert np.median(depth[20:60, 60:240]) == pytest.approx(10.65, rel=0.01)
+
+
+def test_statistics_of_a_written_data_set_are_those_of_its_frames(tmp_path: Path) -> None:
+    settings = SynthSettings(frames=2, seed=5, size=(96, 320))
+    write_dataset(tmp_path, settings)
+    (written,) = describe_folder(tmp_path, 1)
+    made = simulate_frame(settings, 0)
+    direct = describe(made.points, made.calibration, made.labels, made.image)
+    assert (written.in_view, written.in_scan, written.row_shares) == (direct.in_view, direct.in_scan, direct.row_shares)
+    assert max(abs(share) for share in written.row_shares) < 8
 
 
 def test_statistics_compare_two_sets(frames: list[SyntheticFrame], tmp_path: Path) -> None:
