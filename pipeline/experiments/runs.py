@@ -132,7 +132,14 @@ class Run:
 
 def settings_of(budget: Any) -> dict[str, Any]:
     """A budget as plain values without its measured times ("seconds_..."), on which no result depends."""
-    return {name: value for name, value in plain(budget).items() if not name.startswith("seconds_")}
+
+    def untimed(value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            return value
+        return {name: untimed(inner) for name, inner in value.items() if not name.startswith("seconds_")}
+
+    settings: dict[str, Any] = untimed(plain(budget))
+    return settings
 
 
 def plan_run(recipe: Recipe, budget: Any, data: Path | None, seed: int) -> Run:
