@@ -42,7 +42,8 @@ _LEVELS = (
 )
 
 _PROPOSALS_TRAIN = ProposalSettings(before=1024, after=160, iou=0.8, by_distance=True, rotated=True)
-_PROPOSALS_TEST = ProposalSettings(before=2048, after=100, iou=0.7, by_distance=True, rotated=True)
+# Every point may propose: with fewer, near cars of a thousand points each leave no room for those of twenty.
+_PROPOSALS_TEST = ProposalSettings(before=8192, after=256, iou=0.8, by_distance=True, rotated=True)
 _ROIS = RoiSamplingSettings(rois=48, foreground=0.45, background=0.45, easy=0.05, hard_share=0.7)
 
 
@@ -53,8 +54,7 @@ class CompactSettings:
     classes           in the order of the scores
     features          point columns beside x y z, see `detection.inputs.FEATURES`
     levels, propagation  the backbone
-    candidates        per frame, points whose boxes are decoded (best class scores; 70 % nearer than 40 m)
-    proposals_train, proposals_test  suppression of those boxes
+    proposals_train, proposals_test  which points' boxes are decoded and survive suppression
     roi_points        points pooled per RoI from the full cloud
     roi_margin        metres added on every side of a RoI before pooling
     roi_widths        widths of the second stage's point networks
