@@ -1,54 +1,135 @@
-"""`python -m benchmarks` (or `make bench`): every comparison with peers in one run, written to benchmarks/RESULTS.md.
+"""`python -m benchmarks` (or `make bench`): every comparison with peers in one run.
 
-Run it on an idle machine. Each part is a module of its own with more options: `python -m benchmarks.ops --help`.
+Writes benchmarks/RESULTS.md (targets first) and RESULTS.png, and compares the ratios with benchmarks/baseline.json:
+exit code 1 when a result disagrees with its peer's or a ratio fell by more than a fifth. Run it on an idle machine.
+Each part is a module of its own with more options: `python -m benchmarks.ops --help`.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 import os
 import platform
 import subprocess
 import sys
+import tempfile
+import time
+from dataclasses import dataclass
 from pathlib import Path
 
-RESULTS = Path(__file__).parent / "RESULTS.md"
-# title, module and arguments, threads
+from benchmarks.figures import draw
+from benchmarks.record import Curve, Measure, got_worse, load, ratios
+from benchmarks.targets import summary
+
+FOLDER = Path(__file__).parent
+BASELINE = FOLDER / "baseline.json"
+
+
+@dataclass(frozen=True)
+class Part:
+    """A title, the module with its arguments (and those of a quick run), and the threads of OpenMP, "" for all."""
+
+    title: str
+    command: tuple[str, ...]
+    quick: tuple[str, ...]
+    threads: str = ""
+
+
 PARTS = (
-    ("Point operations", ("benchmarks.ops", "--threads", "1", "--repeats", "7"), "1"),
-    ("Point-cloud stage", ("benchmarks.pointcloud",), ""),
-    ("KITTI AP, 3769 frames", ("benchmarks.ap_speed", "--twin", "3769"), "1"),
-    (
-        "PointRCNN2 forward, two threads",
-        ("benchmarks.detector_profile", "--preset", "pointrcnn2", "--threads", "2"),
-        "",
+    Part("Completion networks", ("completion",), ("--quick", "--repeats", "1")),
+    Part("Point-cloud stage", ("pointcloud",), ("--repeats", "1"), "1"),
+    Part("Point operations", ("ops", "--threads", "1", "--repeats", "7"), ("--repeats", "1"), "1"),
+    Part("PointRCNN2 forward", ("detector_profile", "--preset", "pointrcnn2", "--threads", "2"), ("--preset", "small")),
+    Part("Small detector forward", ("detector_profile", "--preset", "small", "--threads", "2"), ("--repeats", "1")),
+    Part("Sparse convolution", ("sparse_conv", "--repeats", "3"), ("--repeats", "1"), "1"),
+    Part("KITTI AP, 3769 frames", ("ap_speed", "--twin", "3769"), ("--frames", "20", "--twin", "20"), "1"),
+    Part(
+        "Batches, 1 and 2 workers",
+        ("batch", "--frames", "24", "--set", "completion.backend=auto"),
+        ("--frames", "4"),
+        "1",
     ),
-    ("Sparse convolution", ("benchmarks.sparse_conv", "--repeats", "3"), "1"),
+    Part("Growth of costs", ("scaling",), ("--quick", "--repeats", "1"), "1"),
 )
 
 
-def run_part(command: tuple[str, ...], threads: str) -> str:
-    """What `python -m COMMAND` prints. Raises CalledProcessError when it fails."""
-    environment = dict(os.environ) | ({"OMP_NUM_THREADS": threads} if threads else {})
+def run_part(part: Part, quick: bool, folder: Path) -> tuple[str, list[Measure], list[Curve]]:
+    """A section of the results, and its figures. A part that fails says so in its section."""
+    command = [*part.command, *(part.quick if quick else ())]
+    environment = dict(os.environ) | ({"OMP_NUM_THREADS": part.threads} if part.threads else {})
+    figures = folder / f"{part.command[0]}-{len(list(folder.iterdir()))}.json"
+    start = time.perf_counter()
     done = subprocess.run(
-        [sys.executable, "-m", *command], env=environment, text=True, stdout=subprocess.PIPE, check=True
+        [sys.executable, "-m", f"benchmarks.{command[0]}", *command[1:], "--json", str(figures)],
+        env=environment,
+        text=True,
+        capture_output=True,
     )
     text = done.stdout.strip()
-    return text if "|" in text else f"```\n{text}\n```"
+    if done.returncode:
+        print(done.stderr[-2000:], file=sys.stderr)
+        text += f"\n\nended with code {done.returncode}: {(done.stderr.strip().splitlines() or [''])[-1]}"
+    shown = (f"OMP_NUM_THREADS={part.threads} " if part.threads else "") + "python -m benchmarks." + " ".join(command)
+    body = text if "|" in text else f"```\n{text}\n```"
+    print(f"{part.title}: {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
+    return f"## {part.title}\n\n`{shown}`\n\n{body}\n", *load(figures)
+
+
+def machine() -> str:
+    """Processor, cores and load."""
+    model = platform.machine()
+    information = Path("/proc/cpuinfo")
+    if information.is_file():
+        lines = information.read_text(encoding="utf-8").splitlines()
+        model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), model)
+    when = time.strftime("%Y-%m-%d", time.gmtime())
+    load = os.getloadavg()[0]
+    return f"{when}, {model}, {os.cpu_count()} cores, load {load:.1f} at the start, Python {platform.python_version()}."
 
 
 def main() -> int:
-    """Runs all parts and writes the results."""
-    load = os.getloadavg()[0]
-    sections = [f"# Benchmarks\n\n{platform.machine()}, {os.cpu_count()} cores, load {load:.1f} at the start.\n"]
-    if load > 0.5:
-        print(f"the machine is busy (load {load:.1f}): ratios may be off", file=sys.stderr)
-    for title, command, threads in PARTS:
-        print(f"{title} ...", file=sys.stderr, flush=True)
-        shown = (f"OMP_NUM_THREADS={threads} " if threads else "") + "python -m " + " ".join(command)
-        sections.append(f"## {title}\n\n`{shown}`\n\n{run_part(command, threads)}\n")
-    RESULTS.write_text("\n".join(sections), encoding="utf-8")
-    print(RESULTS)
-    return 0
+    """Runs the parts and writes the results."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="small sizes: whether everything runs, not how fast")
+    parser.add_argument("--only", nargs="+", help="these modules only, e.g. ops completion")
+    parser.add_argument("--out", type=Path, default=FOLDER, help="folder of RESULTS.md and RESULTS.png")
+    parser.add_argument("--save-baseline", action="store_true", help="keep the ratios of this run as the baseline")
+    options = parser.parse_args()
+    if options.quick and options.out == FOLDER:
+        parser.error("--quick measures nothing worth keeping: give another --out")
+    head = machine()
+    if os.getloadavg()[0] > 0.5:
+        print(f"the machine is busy (load {os.getloadavg()[0]:.1f}): ratios may be off", file=sys.stderr)
+    sections, measures, curves = [], [], []
+    with tempfile.TemporaryDirectory() as folder:
+        for part in PARTS:
+            if options.only is None or part.command[0] in options.only:
+                section, found, grown = run_part(part, options.quick, Path(folder))
+                sections.append(section)
+                measures += found
+                curves += grown
+    baseline = json.loads(BASELINE.read_text(encoding="utf-8")) if BASELINE.is_file() else {}
+    worse = got_worse(ratios(measures), baseline)
+    wrong = [item.case for item in measures if item.agree is False]
+    options.out.mkdir(parents=True, exist_ok=True)
+    draw(measures, curves, options.out / "RESULTS.png")
+    text = results(head, measures, worse, wrong, sections)
+    (options.out / "RESULTS.md").write_text(text, encoding="utf-8")
+    if options.save_baseline:
+        BASELINE.write_text(json.dumps(ratios(measures), indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    print(options.out / "RESULTS.md")
+    print("\n".join([*worse, *(f"{case}: results disagree" for case in wrong)]))
+    return 1 if worse or wrong else 0
+
+
+def results(head: str, measures: list[Measure], worse: list[str], wrong: list[str], sections: list[str]) -> str:
+    """RESULTS.md."""
+    compared = "\n".join(f"- {line}" for line in worse) or "No ratio fell by more than a fifth of the baseline's."
+    doubts = "".join(f"\n- {case}: **results disagree**" for case in wrong)
+    picture = "![Times better than each best peer, and how costs grow](RESULTS.png)"
+    top = f"# Benchmarks\n\n{head}\n\n## Targets\n\n{summary(measures)}\n{compared}{doubts}\n\n{picture}\n"
+    return "\n".join([top, *sections])
 
 
 if __name__ == "__main__":

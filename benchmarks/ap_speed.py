@@ -19,6 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.record import Measure, save
+
 MEASURE = """
 import resource, sys, time
 start = time.process_time()
@@ -74,7 +76,7 @@ def write_set(root: Path, frames: int, seed: int = 0) -> tuple[Path, Path]:
     return labels, detections
 
 
-def time_twin(labels: Path, detections: Path, frames: int) -> None:
+def time_twin(labels: Path, detections: Path, frames: int) -> Measure:
     """The plain Python twin and ours on the first frames (3D and 2D, Car, moderate, IoU 0.7)."""
     from detection.evaluation.kitti_ap import evaluate
     from detection.kitti_format import parse_lines
@@ -91,12 +93,16 @@ def time_twin(labels: Path, detections: Path, frames: int) -> None:
     print(f"twin on {frames} frames  {middle - start:8.2f} s  AP {twin[0]:.4f} {twin[1]:.4f} (2 values)")
     ours = f"AP {rows[0]['moderate']:.4f} {rows[1]['moderate']:.4f} (and easy, hard)"
     print(f"ours on {frames} frames  {end - middle:8.2f} s  {ours}")
+    agree = all(abs(one - row["moderate"]) < 1e-6 for one, row in zip(twin, rows))
+    title = f"{frames} frames, two values, beside the plain Python twin"
+    return Measure(title, end - middle, "s", {"plain Python": middle - start}, agree)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=3769)
     parser.add_argument("--twin", type=int, default=0, metavar="N", help="also time the plain Python twin on N frames")
+    parser.add_argument("--json", help="write the figures to this file")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         labels, detections = write_set(Path(folder), arguments.frames)
@@ -111,8 +117,15 @@ def main() -> None:
         print(f"second: read       {read:6.2f} s")
         print(f"second: evaluate   {rest:6.2f} s")
         print(f"peak memory        {memory:6.0f} MB")
+        title = f"{arguments.frames} frames"
+        measures = [
+            Measure(f"{title}, first evaluation", imports + first),
+            Measure(f"{title}, evaluation", read + rest),
+            Measure(f"{title}, peak memory", memory, "MB"),
+        ]
         if arguments.twin:
-            time_twin(labels, detections, arguments.twin)
+            measures.append(time_twin(labels, detections, arguments.twin))
+        save(arguments.json, measures)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from benchmarks.record import measure_of, save
 from benchmarks.timing import Comparison, compare, format_table, write_table
 from detection import ops
 from detection.ops import _torch_points
@@ -240,12 +241,14 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1, help="threads for torch and for our kernels (default 1)")
     parser.add_argument("--repeats", type=int, default=11)
     parser.add_argument("--out", help="also write the table to this Markdown file")
+    parser.add_argument("--json", help="write the figures to this file")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     rows = []
     for bench in (bench_sampling, bench_neighbours, bench_boxes, bench_features):
         rows += bench(arguments.repeats)
     print(format_table(rows))
+    save(arguments.json, [measure_of(row) for row in rows])
     if arguments.out:
         write_table(rows, arguments.out)
 

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.pointcloud_frame import StreetFrame, street_frame
+from benchmarks.record import Measure, measure_of, save
 from benchmarks.timing import Comparison, compare, format_table, write_table
 from pipeline.pointcloud.depth_sampling import back_project_and_sample
 from pipeline.pointcloud.grid_sampling import GridSampling
@@ -187,10 +188,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--out", type=Path, default=None, help="Markdown file to write")
+    parser.add_argument("--json", help="write the figures to this file")
     arguments = parser.parse_args()
     rows = run(arguments.repeats)
     print(format_table(rows))
-    print(f"temporary memory of ours: {temporary_memory():.1f} MB")
+    memory = temporary_memory()
+    print(f"temporary memory of ours: {memory:.1f} MB")
+    save(arguments.json, [*map(measure_of, rows), Measure("four steps, temporary memory", memory, "MB")])
     if arguments.out is not None:
         write_table(rows, arguments.out)
 

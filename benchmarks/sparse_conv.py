@@ -19,6 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from benchmarks.record import measure_of, save
 from benchmarks.timing import Comparison, compare, format_table
 from detection.models.second import KITTI_VOXELS
 from detection.models.voxel_backbone import SparseTensor, VoxelBackbone, mean_voxels
@@ -156,6 +157,7 @@ def main() -> None:
     parser.add_argument("--backbone", action="store_true", help="SECOND's sparse backbone as a whole")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--json", help="write the figures to this file")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     rows: list[Comparison] = []
@@ -167,6 +169,7 @@ def main() -> None:
             grid = KITTI_VOXELS if args.voxels else CROP
             rows += layer_rows(grid, wanted, channels, not args.voxels, args.repeats)
     print(format_table(rows))
+    save(args.json, [measure_of(row) for row in rows])
 
 
 if __name__ == "__main__":

@@ -65,7 +65,7 @@ def other_than_torch(model: nn.Module, card: Card, device: str, backend: str) ->
             extra = "onnx" if backend == "onnxruntime" else "onnx,openvino"
             raise ImportError(f"backend {backend!r} needs {package}: pip install 'auglidar[{extra}]'")
     graph = exported(model, card)
-    return _onnxruntime(graph) if backend == "onnxruntime" else _openvino(graph)
+    return onnxruntime_session(graph) if backend == "onnxruntime" else openvino_session(graph)
 
 
 def cache_folder() -> Path:
@@ -109,7 +109,8 @@ def export_onnx(model: nn.Module) -> bytes:
         return path.read_bytes()
 
 
-def _onnxruntime(graph: bytes) -> Convolutions:
+def onnxruntime_session(graph: bytes) -> Convolutions:
+    """ONNX Runtime with as many threads as torch; inputs and output as the graph has them."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -123,7 +124,8 @@ def _onnxruntime(graph: bytes) -> Convolutions:
     return run
 
 
-def _openvino(graph: bytes) -> Convolutions:
+def openvino_session(graph: bytes) -> Convolutions:
+    """OpenVINO with as many threads as torch; inputs and output as the graph has them."""
     import openvino
 
     core = openvino.Core()
