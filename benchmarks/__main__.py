@@ -50,6 +50,7 @@ PARTS = (
         ("--frames", "4"),
         "1",
     ),
+    Part("Training", ("training",), ("--quick",), "1"),
     Part("Growth of costs", ("scaling",), ("--quick", "--repeats", "1"), "1"),
 )
 

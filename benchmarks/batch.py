@@ -16,9 +16,13 @@ import sqlite3
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 from benchmarks.record import Measure, save
+from pipeline.frame_files import Written
+from pipeline.runner.jobs import Outcome, Task
+from pipeline.runner.ledger import Ledger
 
 
 def stage_rates(out: Path) -> dict[str, tuple[float, float]]:
@@ -80,6 +84,45 @@ def measures_of(results: dict[int, dict[str, tuple[float, float]]]) -> list[Meas
     return found
 
 
+# The machines of `million_frames`: cores each, GB/s of the disk they share, cores that a GPU is worth.
+CORES, SHARED_DISK, GPU_GAIN = 16, 1.0, 20.0
+
+
+def ledger_row(rows: int = 200) -> float:
+    """Seconds that one finished frame takes to be written into a ledger, durably, in the folder for temporary files."""
+    with tempfile.TemporaryDirectory() as folder:
+        ledger = Ledger(Path(folder) / "ledger.sqlite")
+        start = time.perf_counter()
+        for number in range(rows):
+            ledger.record(Outcome(Task("augment", f"{number:06d}"), {"cloud": Written(10**6, "0" * 64)}, 1.0), "0" * 64)
+        seconds = (time.perf_counter() - start) / rows
+        ledger.close()
+    return seconds
+
+
+def million_frames(rates: dict[str, tuple[float, float]], read: float, written: float) -> str:
+    """Markdown: hours that a million frames take on so many machines, by the model of docs/scaling.md.
+
+    rates    of one worker      read, written  MB per frame
+    """
+    work = {stage: 60 / rate for stage, (rate, _) in rates.items()}
+    ledger = len(work) * ledger_row() * 1e6 / 3600
+    lines = ["| machines | cores, h | with a GPU each, h | shared disk, h | one ledger, h | decides: cores, GPUs |"]
+    lines.append("|---:|---:|---:|---:|---:|---|")
+    disk = (2 * read + written) / SHARED_DISK / 1e3 * 1e6 / 3600
+    for machines in (1, 10, 100, 1000):
+        cores = sum(work.values()) * 1e6 / (machines * CORES) / 3600
+        networks = work.get("complete", 0.0) + work.get("detect", 0.0)
+        others = (sum(work.values()) - networks) / CORES
+        gpu = max(networks / GPU_GAIN, others) * 1e6 / machines / 3600
+        decides = [
+            max((hours, name) for hours, name in ((own, kind), (disk, "disk"), (ledger, "ledger")))[1]
+            for own, kind in ((cores, "cores"), (gpu, "GPUs"))
+        ]
+        lines.append(f"| {machines} | {cores:.1f} | {gpu:.1f} | {disk:.1f} | {ledger:.1f} | {', '.join(decides)} |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     """Prints a Markdown table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.batch", description=__doc__)
@@ -106,8 +149,14 @@ def main() -> None:
     print()
     for workers, rates in results.items():
         print(f"all stages, {workers} workers: {end_to_end(rates):.2f} frames/s")
+    written = sum(sizes.get(name, 0.0) for name in ("depth", "twin", "cloud", "detections"))
+    read = sum(sizes.get(name, 0.0) for name in ("image_2", "velodyne", "calib"))
     print("MB per frame: " + ", ".join(f"{name} {size:.2f}" for name, size in sizes.items()))
     print(f"peak memory of the largest process: {resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e3:.0f} MB")
+    if read:
+        assumed = f"{CORES} cores a machine, {SHARED_DISK:g} GB/s of shared disk, a GPU worth {GPU_GAIN:g} cores"
+        print(f"\na ledger row takes {1e3 * ledger_row():.2f} ms; a million frames, assumed {assumed}:\n")
+        print(million_frames(base, read, written))
     save(args.json, measures_of(results))
 
 

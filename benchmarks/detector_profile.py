@@ -65,8 +65,24 @@ def frame(points: int, channels: int, seed: int = 0) -> PointBatch:
     return PointBatch(rows[None, :points].contiguous(), [rows[:20000]], [], [])
 
 
-def profile_forward(preset_name: str, repeats: int) -> tuple[list[tuple[str, float, int]], float]:
-    """Rows (operation, milliseconds and calls per forward), slowest first; and the wall time in milliseconds."""
+def batch_times(model: Any, one: PointBatch, sizes: tuple[int, ...], repeats: int) -> dict[int, float]:
+    """Milliseconds per frame when so many frames go through together."""
+    found = {}
+    for size in sizes:
+        batch = PointBatch(one.points.repeat(size, 1, 1), one.clouds * size, [], [])
+        times = []
+        with torch.inference_mode():
+            for _ in range(repeats + 1):
+                start = time.perf_counter()
+                model.raw_detections(batch)
+                times.append(time.perf_counter() - start)
+        found[size] = float(np.median(times[1:])) * 1e3 / size
+    return found
+
+
+def profile_forward(preset_name: str, repeats: int) -> tuple[list[tuple[str, float, int]], float, dict[int, float]]:
+    """Rows (operation, milliseconds and calls per forward), slowest first; the wall time in milliseconds; and that of
+    one frame in batches of 1, 2 and 4."""
     preset = PRESETS[preset_name]()
     torch.manual_seed(0)
     model: Any = preset.build().eval()
@@ -89,7 +105,7 @@ def profile_forward(preset_name: str, repeats: int) -> tuple[list[tuple[str, flo
         total, calls = rows.get(key, (0.0, 0))
         rows[key] = (total + microseconds / 1e3 / repeats, calls + event.count // repeats)
     ordered = sorted(((name, *values) for name, values in rows.items()), key=lambda row: -row[1])
-    return ordered, float(np.median(times)) * 1e3
+    return ordered, float(np.median(times)) * 1e3, batch_times(model, batch, (1, 2, 4), repeats)
 
 
 def main() -> int:
@@ -102,7 +118,7 @@ def main() -> int:
     parser.add_argument("--json", help="write the figures to this file")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    rows, wall = profile_forward(options.preset, options.repeats)
+    rows, wall, batches = profile_forward(options.preset, options.repeats)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     lines = [
         f"{options.preset}: {wall:.0f} ms per frame (median of {options.repeats}), {options.threads} threads, "
@@ -111,6 +127,8 @@ def main() -> int:
         "| operation | ms per frame | calls |",
         "| --- | ---: | ---: |",
         *(f"| {name} | {milliseconds:.1f} | {calls} |" for name, milliseconds, calls in rows[:16]),
+        "",
+        "Batches: " + ", ".join(f"{size} frames {time:.1f} ms each" for size, time in batches.items()),
     ]
     print("\n".join(lines))
     if options.out is not None:

@@ -18,13 +18,15 @@ from benchmarks.ap_speed import write_set
 from benchmarks.completion import fastest
 from benchmarks.ops import lidar_cloud, street_boxes
 from benchmarks.pointcloud import ours as four_steps
-from benchmarks.pointcloud_frame import StreetFrame, street_frame
+from benchmarks.pointcloud_frame import StreetFrame, kitti_calibration, street_frame
 from benchmarks.record import Curve, save
 from completion.infer import load_completer
 from completion.types import CompletedDepth
 from detection import ops
 from detection.evaluation.kitti_ap import evaluate
+from detection.infer import load_detector
 from detection.inputs import ground_height
+from detection.types import PointFrame
 
 # A cost that grows faster than this is looked at: the text says why.
 LIMIT = 1.15
@@ -62,6 +64,21 @@ def point_curves(sizes: Sequence[int], repeats: int) -> list[Curve]:
 
     kinds = {"furthest points": sampling, "ball query": balls, "three nearest": nearest, "ground height": ground}
     return [curve(f"{name}, points", sizes, make, repeats) for name, make in kinds.items()]
+
+
+def detector_curve(sizes: Sequence[int], repeats: int) -> Curve:
+    """The embedded LiDAR detector over the points of a scan."""
+    detector = load_detector("small_lidar")
+    calibration = kitti_calibration()
+
+    def detect(count: int) -> Callable[[], Any]:
+        camera = lidar_cloud(count)
+        velo = camera @ calibration.T_velo_cam[:3, :3].T + calibration.T_velo_cam[:3, 3]
+        points = np.column_stack([velo, np.zeros(count)]).astype(np.float32)
+        frame = PointFrame(points, calibration.T_cam_velo, calibration.P2, (375, 1242), "scan")
+        return lambda: detector.detect(frame)
+
+    return curve("detection, points", sizes, detect, repeats)
 
 
 def box_curves(sizes: Sequence[int], repeats: int) -> list[Curve]:
@@ -149,7 +166,8 @@ def main() -> None:
     points = (1000, 2000) if options.quick else (10_000, 30_000, 100_000, 300_000, 500_000)
     boxes = (50, 100) if options.quick else (100, 300, 1000, 3000, 10_000)
     frames = (2, 4) if options.quick else (10, 30, 100, 300, 1000)
-    curves = point_curves(points, options.repeats) + box_curves(boxes, options.repeats)
+    curves = [*point_curves(points, options.repeats), detector_curve(points, options.repeats)]
+    curves += box_curves(boxes, options.repeats)
     curves += image_curves((8, 4) if options.quick else (4, 3, 2, 1), options.repeats)
     curves += frame_curves(frames, options.repeats)
     print(table(curves))

@@ -39,7 +39,7 @@ class Rings:
 
 
 @njit(cache=True, nogil=True)
-def _sweep(sparse, depth, cost):  # type: ignore[no-untyped-def]
+def sweep(sparse, depth, cost):  # type: ignore[no-untyped-def]
     """Carries samples downwards and sideways; `cost` is steps down plus 2.5 times steps to the side."""
     height, width = sparse.shape
     for y in range(height):
@@ -64,14 +64,10 @@ def _sweep(sparse, depth, cost):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def enclose(sparse):  # type: ignore[no-untyped-def]
-    """(H, W) float32 sparse depth -> (5, H, W): above, below, between, distance above, distance below."""
-    height, width = sparse.shape
-    out = np.empty((5, height, width), dtype=np.float32)
-    _sweep(sparse, out[0], out[3])
-    _sweep(sparse[::-1], out[1, ::-1], out[4, ::-1])
-    for y in range(height):
-        for x in range(width):
+def interpolate_rows(first, last, out):  # type: ignore[no-untyped-def]
+    """Rows first..last of `enclose` from what both sweeps left in out (5, H, W)."""
+    for y in range(first, last):
+        for x in range(out.shape[2]):
             above, below = out[3, y, x] < 1e6, out[4, y, x] < 1e6
             if above and below:
                 w = (out[4, y, x] + 1e-3) / (out[3, y, x] + out[4, y, x] + 2e-3)
@@ -81,6 +77,16 @@ def enclose(sparse):  # type: ignore[no-untyped-def]
                 out[0, y, x] = out[1, y, x] = out[2, y, x] = only
             out[3, y, x] = min(out[3, y, x], np.float32(FARTHEST))
             out[4, y, x] = min(out[4, y, x], np.float32(FARTHEST))
+
+
+@njit(cache=True, nogil=True)
+def enclose(sparse):  # type: ignore[no-untyped-def]
+    """(H, W) float32 sparse depth -> (5, H, W): above, below, between, distance above, distance below."""
+    height, width = sparse.shape
+    out = np.empty((5, height, width), dtype=np.float32)
+    sweep(sparse, out[0], out[3])
+    sweep(sparse[::-1], out[1, ::-1], out[4, ::-1])
+    interpolate_rows(0, height, out)
     return out
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from completion.inputs import scale_rgb
 from completion.mixture import surface_shares
-from completion.models.rings import enclose
+from completion.models.rings import interpolate_rows, sweep
 from completion.models.selection import CANDIDATES, CHANNELS, COLUMN_SHIFTS, INPUTS, Selection
 from completion.twin_surface import fuse
 
@@ -215,6 +215,25 @@ def _in_threads(kernel: Callable[..., None], rows: int, *arguments: object) -> N
             done.result()
 
 
+def _rings(sparse: Float) -> tuple[Float, Float]:
+    """`rings.enclose` (5, H, W) and the natural logarithms of its depths (3, H, W), with as many threads as torch."""
+    rings = np.empty((5, *sparse.shape), np.float32)
+    logs = np.empty((3, *sparse.shape), np.float32)
+    sides = ((sparse, rings[0], rings[3]), (sparse[::-1], rings[1, ::-1], rings[4, ::-1]))
+
+    def sweep_sides(first: int, last: int) -> None:
+        for side in sides[first:last]:
+            sweep(*side)
+
+    def finish_rows(first: int, last: int) -> None:
+        interpolate_rows(first, last, rings)
+        np.log(rings[:3, first:last], out=logs[:, first:last])
+
+    _in_threads(sweep_sides, 2)
+    _in_threads(finish_rows, len(sparse))
+    return rings, logs
+
+
 def complete_mixture(
     model: Selection,
     convolutions: Callable[[Tensor], Tensor] | None,
@@ -233,8 +252,7 @@ def complete_mixture(
     top, right = -height % 32, -width % 32
     padded = np.pad(sparse, ((top, 0), (0, right)))
     pixels = np.pad(image, ((top, 0), (0, right), (0, 0)), mode="edge")
-    rings = enclose(padded)
-    logs = np.log(rings[:3])
+    rings, logs = _rings(padded)
     levels = torch.arange(256, dtype=torch.float32).expand(1, 3, 1, 256)
     colours = scale_rgb(levels, scaling)[0, :, 0].contiguous().numpy()
     half = (padded.shape[0] // 2, padded.shape[1] // 2)
