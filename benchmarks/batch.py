@@ -28,7 +28,9 @@ from pipeline.runner.ledger import Ledger
 def stage_rates(out: Path) -> dict[str, tuple[float, float]]:
     """Stage -> (frames per minute, mean seconds of work per frame) of a finished run."""
     connection = sqlite3.connect(out / "ledger.sqlite")
-    query = "SELECT stage, COUNT(*), MIN(finished_at), MAX(finished_at), AVG(seconds) FROM done GROUP BY stage"
+    query = (
+        "SELECT stage, COUNT(*), MIN(finished_at), MAX(finished_at), AVG(seconds) FROM done GROUP BY stage ORDER BY 3"
+    )
     rows = connection.execute(query).fetchall()
     connection.close()
     return {stage: (60 * (count - 1) / max(last - first, 1e-9), mean) for stage, count, first, last, mean in rows}

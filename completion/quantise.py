@@ -75,7 +75,7 @@ def quantised_graph(graph: bytes, samples: Sequence[Sequence[Tensor]]) -> bytes:
 
     names = [given.name for given in onnx.load_model_from_string(graph).graph.input]
 
-    class Samples(CalibrationDataReader):  # type: ignore[misc]
+    class Samples(CalibrationDataReader):
         def __init__(self) -> None:
             self.rows: Iterator[dict[str, NDArray]] = iter(
                 [{name: item.contiguous().numpy() for name, item in zip(names, sample)} for sample in samples]
