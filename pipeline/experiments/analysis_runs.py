@@ -39,7 +39,9 @@ def run(recipe: Recipe, context: Context) -> Outcome:
     what = str(recipe.settings["what"])
     if what not in ANALYSES:
         raise UsageError(f"unknown analysis {what!r}; known: {', '.join(ANALYSES)}")
-    return Outcome(ANALYSES[what](recipe, context))
+    numbers = ANALYSES[what](recipe, context)
+    # Exact: every resample would give the same.
+    return Outcome(numbers, draws={name: [value] for name, value in numbers.items()})
 
 
 def _expected_loss(recipe: Recipe, context: Context) -> dict[str, float]:

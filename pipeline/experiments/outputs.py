@@ -25,6 +25,8 @@ def describe(order: Order, result: TableResult) -> list[str]:
     data = SYNTHETIC if order.data is None else order.data.name
     changed = {kind: dict(changes) for kind, changes in (order.changes or {}).items() if changes}
     lines = [f"Data: {data}. Budget: {order.budget}{f' with {changed}' if changed else ''}. Seeds: {order.seeds}."]
+    if result.table.needs == "nothing":
+        lines = ["An exact computation: no data, no training, the same for every budget and seed."]
     lines.append(f"Command: {command(order, result)}")
     return lines
 

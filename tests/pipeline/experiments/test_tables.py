@@ -127,3 +127,26 @@ def test_lidar_rows_choose_or_replace() -> None:
 def test_a_claim_about_rows_that_are_not_there_is_refused() -> None:
     with pytest.raises(ValueError, match="names z, which it has not"):
         small_table(Claim("c", "x", ("a",), ("z",)))
+
+
+def test_findings_name_orderings_that_exist() -> None:
+    from pipeline.experiments.findings import FINDINGS
+
+    for finding in FINDINGS:
+        for kind, number, beginnings in finding.tests:
+            texts = [claim.text for claim in find(kind, number).claims]
+            for beginning in beginnings:
+                assert any(text.startswith(beginning) for text in texts), (number, beginning)
+
+
+def test_findings_say_what_is_not_decidable(tmp_path: Path) -> None:
+    from pipeline.experiments.findings import CONFIRMED, NOT_CONFIRMED, NOT_DECIDABLE, markdown, summary
+    from pipeline.experiments.intervals import Verdict
+
+    verdicts = {name: Verdict("t", name, "") for name in (HOLDS, FAILS, PERHAPS, UNKNOWN)}
+    assert summary([verdicts[HOLDS]]) == CONFIRMED
+    assert summary([verdicts[HOLDS], verdicts[PERHAPS]]) == NOT_DECIDABLE
+    assert summary([verdicts[PERHAPS], verdicts[FAILS]]) == NOT_CONFIRMED
+    assert summary([]) == NOT_DECIDABLE
+    text = markdown(tmp_path, "smoke", 1)
+    assert "TWISE smears less than L2 and L1 (4.5). | **not decidable**: not run |" in text

@@ -1,0 +1,124 @@
+"""The thesis' claims of chapters 2 to 4 beside the runs of an experiment folder.
+
+    python -m pipeline.experiments.findings --out runs/experiments --budget small --seeds 3
+
+prints Markdown: per claim whether our runs confirm it, with the margins. docs/findings.md is written from it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.experiments.catalogue import find
+from pipeline.experiments.intervals import FAILS, HOLDS, UNKNOWN, Verdict
+from pipeline.experiments.plan import Order, gather, make_plan
+
+CONFIRMED, NOT_CONFIRMED, NOT_DECIDABLE = "confirmed", "not confirmed", "not decidable"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A claim in one sentence, and the orderings that test it: (kind, number, beginnings of the claims' texts)."""
+
+    claim: str
+    tests: tuple[tuple[str, str, tuple[str, ...]], ...]
+
+
+FINDINGS: tuple[Finding, ...] = (
+    Finding(
+        "A linear filter on depth invents points between two surfaces, on Depth Coefficients it does not (3.3).",
+        (("figure", "3.3", ("coefficients put",)),),
+    ),
+    Finding(
+        "Decoding all coefficients lowers RMSE, decoding three lowers tMAE (3.2).",
+        (("table", "3.2", ("64R", "32R", "16R")),),
+    ),
+    Finding(
+        "Depth Coefficients help only at input and output together (3.3).",
+        (("table", "3.3", ("DC in", "CE out")),),
+    ),
+    Finding(
+        "TWISE smears less than L2 and L1 (4.5).",
+        (("table", "4.5", ("MultiStack: TWISE smears", "Res-18: TWISE smears")),),
+    ),
+    Finding(
+        "TWISE has the lowest MAE and tMAE of all losses, on both backbones (4.5).",
+        (("table", "4.5", ("MultiStack: TWISE has the lowest", "Res-18: TWISE has")),),
+    ),
+    Finding("L2 has the lower RMSE (4.5).", (("table", "4.5", ("MultiStack: L2", "Res-18: L2")),)),
+    Finding(
+        "Averaging both surfaces has a lower RMSE than choosing one; each surface alone is worse (4.6).",
+        (("table", "4.6", ("the mean has a lower RMSE", "each surface alone")),),
+    ),
+    Finding(
+        "RMSE prefers mixed depth: the mean of both surfaces beats the learned sigma in it (4.6).",
+        (("table", "4.6", ("the mean has the",)),),
+    ),
+    Finding("Learned sigma is best, and needs colour (4.6).", (("table", "4.6", ("learned sigma", "colour lowers")),)),
+    Finding("gamma 2 is a compromise (4.7).", (("table", "4.7", ("gamma",)),)),
+    Finding(
+        "TWISE suffers least from fewer LiDAR rows, down to none (4.8).",
+        (("table", "4.8", ("64R", "32R", "16R", "8R", "0R")),),
+    ),
+    Finding("Large errors lie at boundaries (4.2).", (("table", "4.2", ("MAE", "tMAE")),)),
+    Finding(
+        "MAE ranks methods alike on clean and on semi-dense ground truth, RMSE does not (4.11).",
+        (("figure", "4.11", ("MultiStack: MAE", "MultiStack: RMSE", "Res-18: MAE", "Res-18: RMSE")),),
+    ),
+    Finding("On clean ground truth TWISE's RMSE is no worse than L2's (4.11).", (("figure", "4.11", ("on clean",)),)),
+)  # fmt: skip
+
+
+def summary(verdicts: Sequence[Verdict]) -> str:
+    """Confirmed when every ordering holds, not confirmed when one does not, else not decidable."""
+    found = [verdict.verdict for verdict in verdicts]
+    if FAILS in found:
+        return NOT_CONFIRMED
+    return CONFIRMED if found and all(verdict == HOLDS for verdict in found) else NOT_DECIDABLE
+
+
+def markdown(out: Path, budget: str, seeds: int) -> str:
+    """All findings with their evidence, from the finished runs in `out`."""
+    lines = ["| claim of the thesis | in our runs |", "|---|---|"]
+    details = []
+    for finding in FINDINGS:
+        verdicts = _verdicts(finding, out, budget, seeds)
+        lines.append(f"| {finding.claim} | **{summary(verdicts)}**{_counts(verdicts)} |")
+        details += [f"### {finding.claim}", "", f"**{summary(verdicts)[0].upper()}{summary(verdicts)[1:]}.**", ""]
+        details += [f"- {v.text}: {v.verdict}" + (f" ({v.evidence})" if v.evidence else "") for v in verdicts]
+        details.append("")
+    return "\n".join([*lines, "", *details])
+
+
+def _counts(verdicts: Sequence[Verdict]) -> str:
+    if all(verdict.verdict == UNKNOWN for verdict in verdicts):
+        return ": not run"
+    holds = sum(verdict.verdict == HOLDS for verdict in verdicts)
+    fails = sum(verdict.verdict == FAILS for verdict in verdicts)
+    return f": {holds} of {len(verdicts)} orderings hold, {fails} do not"
+
+
+def _verdicts(finding: Finding, out: Path, budget: str, seeds: int) -> list[Verdict]:
+    found = []
+    for kind, number, beginnings in finding.tests:
+        table = find(kind, number)
+        plan = make_plan(Order((table,), out, budget, seeds))
+        found += [v for v in gather(plan, table).verdicts if v.text.startswith(beginnings)]
+    return found
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command of the file's first lines."""
+    parser = argparse.ArgumentParser(description="The thesis' claims beside the runs of an experiment folder.")
+    parser.add_argument("--out", type=Path, default=Path("runs/experiments"))
+    parser.add_argument("--budget", choices=("smoke", "small", "paper"), default="small")
+    parser.add_argument("--seeds", type=int, default=3)
+    options = parser.parse_args(arguments)
+    print(markdown(options.out, options.budget, options.seeds))
+
+
+if __name__ == "__main__":
+    main()
