@@ -2,7 +2,8 @@
 
     python -m pipeline.experiments.findings --out runs/experiments --budget small --seeds 3
 
-prints Markdown: per claim whether our runs confirm it, with the margins. docs/findings.md is written from it.
+prints Markdown: per claim whether our runs confirm it, with the margins; `--into docs/findings.md` puts it between the
+two marks of that page.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ from pathlib import Path
 from pipeline.experiments.catalogue import find
 from pipeline.experiments.intervals import FAILS, HOLDS, UNKNOWN, Verdict
 from pipeline.experiments.plan import Order, gather, make_plan
+from pipeline.runner.atomic import write_text
 
+BEGIN, END = "<!-- findings: begin -->", "<!-- findings: end -->"
 CONFIRMED, NOT_CONFIRMED, NOT_DECIDABLE = "confirmed", "not confirmed", "not decidable"
 
 
@@ -87,6 +90,8 @@ def markdown(out: Path, budget: str, seeds: int) -> str:
     for finding in FINDINGS:
         verdicts = _verdicts(finding, out, budget, seeds)
         lines.append(f"| {finding.claim} | **{summary(verdicts)}**{_counts(verdicts)} |")
+        if all(verdict.verdict == UNKNOWN for verdict in verdicts):
+            continue
         details += [f"### {finding.claim}", "", f"**{summary(verdicts)[0].upper()}{summary(verdicts)[1:]}.**", ""]
         details += [f"- {v.text}: {v.verdict}" + (f" ({v.evidence})" if v.evidence else "") for v in verdicts]
         details.append("")
@@ -116,8 +121,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/experiments"))
     parser.add_argument("--budget", choices=("smoke", "small", "paper"), default="small")
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--into", type=Path, help="page whose part between the marks is replaced")
     options = parser.parse_args(arguments)
-    print(markdown(options.out, options.budget, options.seeds))
+    text = markdown(options.out, options.budget, options.seeds)
+    if options.into is None:
+        print(text)
+        return
+    page = options.into.read_text(encoding="utf-8")
+    if BEGIN not in page or END not in page:
+        parser.error(f"--into {options.into}: expected a page with {BEGIN} and {END}")
+    write_text(options.into, page.partition(BEGIN)[0] + f"{BEGIN}\n\n{text}\n{END}" + page.partition(END)[2])
 
 
 if __name__ == "__main__":
