@@ -78,7 +78,7 @@ def draw_counts(result: TableResult, figure: Any) -> None:
     for axis in (left, right):
         names = [row.label.replace(", ", ",\n").replace(" and ", "\nand ") for row in rows]
         axis.set_xticks(places, names, fontsize=8)
-        axis.legend(fontsize=8)
+        axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
 
 
 def draw_bev(result: TableResult, figure: Any) -> None:
