@@ -126,8 +126,8 @@ TABLE_5_8 = ap_table(
         row(_MISALIGNED, exact(noise=MISALIGNED), (70.9, 56.3, 47.4, 77.4, 63.6, 55.9)),
     ),
     (
-        claim("blur hurts", (_NOISE_FREE,), (_BLURRED,)),
-        claim("misalignment hurts", (_NOISE_FREE,), (_MISALIGNED,)),
+        claim("blur costs AP", (_NOISE_FREE,), (_BLURRED,)),
+        claim("misalignment costs AP", (_NOISE_FREE,), (_MISALIGNED,)),
         claim("blur hurts at least as much as misalignment", (_MISALIGNED,), (_BLURRED,)),
     ),
     misprints=("the caption cites KITTI [1] for Virtual KITTI [100]",),

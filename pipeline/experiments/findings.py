@@ -1,9 +1,9 @@
-"""The thesis' claims of chapters 2 to 4 beside the runs of an experiment folder.
+"""The thesis' claims beside the runs of an experiment folder: chapters 2 to 4 here, 5 in `chapter_5_findings`.
 
     python -m pipeline.experiments.findings --out runs/experiments --budget small --seeds 3
 
 prints Markdown: per claim whether our runs confirm it, with the margins; `--into docs/findings.md` puts it between the
-two marks of that page.
+two marks of that page. `--chapter 5` does the same for detection, between marks of its own.
 """
 
 from __future__ import annotations
@@ -19,12 +19,16 @@ from pipeline.experiments.plan import Order, gather, make_plan
 from pipeline.runner.atomic import write_text
 
 BEGIN, END = "<!-- findings: begin -->", "<!-- findings: end -->"
+DETECTION_MARKS = ("<!-- detection findings: begin -->", "<!-- detection findings: end -->")
 CONFIRMED, NOT_CONFIRMED, NOT_DECIDABLE = "confirmed", "not confirmed", "not decidable"
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A claim in one sentence, and the orderings that test it: (kind, number, beginnings of the claims' texts)."""
+    """A claim in one sentence, and the orderings that test it: (kind, number, beginnings of the claims' texts).
+
+    A number may end in "@16": the table at so many LiDAR rows.
+    """
 
     claim: str
     tests: tuple[tuple[str, str, tuple[str, ...]], ...]
@@ -83,11 +87,11 @@ def summary(verdicts: Sequence[Verdict]) -> str:
     return CONFIRMED if found and all(verdict == HOLDS for verdict in found) else NOT_DECIDABLE
 
 
-def markdown(out: Path, budget: str, seeds: int) -> str:
+def markdown(out: Path, budget: str, seeds: int, findings: Sequence[Finding] = FINDINGS) -> str:
     """All findings with their evidence, from the finished runs in `out`."""
     lines = ["| claim of the thesis | in our runs |", "|---|---|"]
     details = []
-    for finding in FINDINGS:
+    for finding in findings:
         verdicts = _verdicts(finding, out, budget, seeds)
         lines.append(f"| {finding.claim} | **{summary(verdicts)}**{_counts(verdicts)} |")
         if all(verdict.verdict == UNKNOWN for verdict in verdicts):
@@ -109,7 +113,9 @@ def _counts(verdicts: Sequence[Verdict]) -> str:
 def _verdicts(finding: Finding, out: Path, budget: str, seeds: int) -> list[Verdict]:
     found = []
     for kind, number, beginnings in finding.tests:
+        number, _, rows = number.partition("@")
         table = find(kind, number)
+        table = table.with_lidar_rows(int(rows)) if rows else table
         plan = make_plan(Order((table,), out, budget, seeds))
         found += [v for v in gather(plan, table).verdicts if v.text.startswith(beginnings)]
     return found
@@ -121,16 +127,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/experiments"))
     parser.add_argument("--budget", choices=("smoke", "small", "paper"), default="small")
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--chapter", choices=("4", "5"), default="4", help="4: chapters 2 to 4")
     parser.add_argument("--into", type=Path, help="page whose part between the marks is replaced")
     options = parser.parse_args(arguments)
-    text = markdown(options.out, options.budget, options.seeds)
+    from pipeline.experiments import chapter_5_findings
+
+    choices = {"4": (FINDINGS, (BEGIN, END)), "5": (chapter_5_findings.FINDINGS, DETECTION_MARKS)}
+    chosen, (begin, end) = choices[options.chapter]
+    text = markdown(options.out, options.budget, options.seeds, chosen)
     if options.into is None:
         print(text)
         return
     page = options.into.read_text(encoding="utf-8")
-    if BEGIN not in page or END not in page:
-        parser.error(f"--into {options.into}: expected a page with {BEGIN} and {END}")
-    write_text(options.into, page.partition(BEGIN)[0] + f"{BEGIN}\n\n{text}\n{END}" + page.partition(END)[2])
+    if begin not in page or end not in page:
+        parser.error(f"--into {options.into}: expected a page with {begin} and {end}")
+    write_text(options.into, page.partition(begin)[0] + f"{begin}\n\n{text}\n{end}" + page.partition(end)[2])
 
 
 if __name__ == "__main__":

@@ -8,7 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.experiments.intervals import Verdict, judge
-from pipeline.experiments.runs import Outcome, Run, available, budget_of, do_run, kind_module, plan_run, read_result
+from pipeline.experiments.runs import (
+    UNSEEDED,
+    Outcome,
+    Run,
+    available,
+    budget_of,
+    do_run,
+    kind_module,
+    plan_run,
+    read_result,
+)
 from pipeline.experiments.tables import Recipe, Table
 
 Changes = Mapping[str, Mapping[str, Any]]
@@ -63,9 +73,10 @@ def make_plan(order: Order) -> Plan:
 
 
 def runs_of(recipe: Recipe, order: Order) -> list[Run]:
-    """One run per seed."""
+    """One run per seed; one in all where no seed matters."""
     budget = budget_of(recipe.kind, order.budget, order.changes)
-    return [plan_run(recipe, budget, order.data, seed) for seed in range(order.seeds)]
+    seeds = 1 if recipe.kind in UNSEEDED else order.seeds
+    return [plan_run(recipe, budget, order.data, seed) for seed in range(seeds)]
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,10 @@ KINDS: dict[str, str] = {
 }
 
 
+# Kinds whose runs depend on no seed: one run, whatever the number of seeds asked for.
+UNSEEDED = ("cloud",)
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What a run found; every value finite or NaN.

@@ -14,7 +14,9 @@ from detection.evaluation.difficulty import KittiDifficulty
 from detection.kitti_format import KittiObject
 from pipeline.experiments import chapter_5, chapter_5_exact, chapter_5_figures, detection_scores
 from pipeline.experiments.catalogue import find
+from pipeline.experiments.chapter_5_findings import FINDINGS
 from pipeline.experiments.cloud_runs import picked_by_fps
+from pipeline.experiments.findings import markdown as findings_page
 from pipeline.experiments.intervals import margin
 from pipeline.experiments.outputs import markdown, write_outputs
 from pipeline.experiments.plan import Order, TableResult, carry_out, gather, make_plan
@@ -133,6 +135,18 @@ def test_equal_recipes_are_shared_and_rows_change_them(tmp_path: Path) -> None:
     other = make_plan(Order((sparse,), tmp_path, "small", 1)).runs[sparse.name]["PointRCNN2, L"][0]
     assert other.recipe.settings["rows"] == 16
     assert other.key != keys["table_5.3"]["PointRCNN2, L"]
+
+
+def test_findings_name_orderings_that_exist_and_clouds_need_no_seeds(tmp_path: Path) -> None:
+    for finding in FINDINGS:
+        for kind, number, beginnings in finding.tests:
+            texts = [claim.text for claim in find(kind, number.partition("@")[0]).claims]
+            assert all(any(text.startswith(beginning) for text in texts) for beginning in beginnings), finding.claim
+    page = findings_page(tmp_path, "smoke", 1, FINDINGS)
+    assert page.count("**not decidable**: not run") == len(FINDINGS)
+    plan = make_plan(Order((find("figure", "5.4"), chapter_5_exact.TABLE_5_8), tmp_path, "smoke", 3))
+    assert {len(runs) for runs in plan.runs["figure_5.4"].values()} == {1}
+    assert {len(runs) for runs in plan.runs["table_5.8"].values()} == {3}
 
 
 def car(x: float, score: float | None = None) -> KittiObject:
