@@ -102,7 +102,13 @@ def main() -> int:
     head = machine()
     if os.getloadavg()[0] > 0.5:
         print(f"the machine is busy (load {os.getloadavg()[0]:.1f}): ratios may be off", file=sys.stderr)
-    sections, measures, curves = [], [], []
+    sections: list[str] = []
+    measures: list[Measure] = []
+    curves: list[Curve] = []
+    worse: list[str] = []
+    wrong: list[str] = []
+    baseline = json.loads(BASELINE.read_text(encoding="utf-8")) if BASELINE.is_file() else {}
+    options.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         for part in PARTS:
             if options.only is None or part.command[0] in options.only:
@@ -110,13 +116,12 @@ def main() -> int:
                 sections.append(section)
                 measures += found
                 curves += grown
-    baseline = json.loads(BASELINE.read_text(encoding="utf-8")) if BASELINE.is_file() else {}
-    worse = got_worse(ratios(measures), baseline)
-    wrong = [item.case for item in measures if item.agree is False]
-    options.out.mkdir(parents=True, exist_ok=True)
+                worse = got_worse(ratios(measures), baseline)
+                wrong = [item.case for item in measures if item.agree is False]
+                # After every part: a run that is stopped leaves what it measured.
+                text = results(head, measures, worse, wrong, sections)
+                (options.out / "RESULTS.md").write_text(text, encoding="utf-8")
     draw(measures, curves, options.out / "RESULTS.png")
-    text = results(head, measures, worse, wrong, sections)
-    (options.out / "RESULTS.md").write_text(text, encoding="utf-8")
     if options.save_baseline:
         BASELINE.write_text(json.dumps(ratios(measures), indent=1, sort_keys=True) + "\n", encoding="utf-8")
     print(options.out / "RESULTS.md")
