@@ -23,7 +23,7 @@ def draw(measures: Sequence[Measure], curves: Sequence[Curve], path: Path) -> Pa
     _bars(left, compared)
     _growth(right, curves)
     figure.tight_layout()
-    figure.savefig(path, dpi=90)
+    figure.savefig(path, dpi=90, bbox_inches="tight")
     pyplot.close(figure)
     return path
 
@@ -57,4 +57,4 @@ def _growth(axes, curves: Sequence[Curve]) -> None:  # type: ignore[no-untyped-d
     axes.set_ylabel("milliseconds")
     axes.grid(True, which="both", linewidth=0.3)
     if curves:
-        axes.legend(fontsize=7)
+        axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=2)
