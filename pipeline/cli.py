@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import difflib
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from pipeline.errors import DataError, UsageError
 from pipeline.verbs import available_verbs, verb_module
@@ -30,6 +32,8 @@ examples:
       scores and report of that run, with its own configuration
   run_pipeline --config configs/kitti.yaml --data KITTI --frames 0:100 --set augment.preset=D_F --dry-run
       what would be done: frames, files, GB, minutes
+  run_pipeline --stage report --out runs/kitti --json result.json
+      frames done and failed per stage, scores and paths, for a script
   run_pipeline --stage evaluate --labels KITTI/training/label_2 --detections runs/kitti/detections
       AP of any two folders
 
@@ -136,6 +140,13 @@ def main_parser(verbs: dict[str, str]) -> argparse.ArgumentParser:
         choices=("html", "png", "pdf", "svg", "rrd", "mcap"),
         help="with --stage report: figures for papers, or recordings for Rerun and Foxglove, beside the page",
     )
+    add(
+        "--json",
+        nargs="?",
+        const="-",
+        metavar="FILE",
+        help="how it went, as JSON: into FILE, or on standard output (everything else then goes to standard error)",
+    )
     add("--dry-run", action="store_true", help="print frames, files, GB and minutes; write nothing")
     return parser
 
@@ -159,8 +170,10 @@ def _shard(text: str) -> tuple[int, int]:
 
 def _run_stages(args: argparse.Namespace, arguments: Sequence[str]) -> int:
     import json
+    from pathlib import Path
 
     from pipeline.run import Request, carry_out
+    from pipeline.runner.atomic import write_text
 
     overrides = list(args.overrides)
     # JSON strings are YAML strings: a folder called "1e3" or "yes" stays text.
@@ -171,18 +184,27 @@ def _run_stages(args: argparse.Namespace, arguments: Sequence[str]) -> int:
         overrides.append(f"report.format={args.format}")
     if args.workers is not None:
         overrides.append(f"run.workers={args.workers}")
-    return carry_out(
-        Request(
-            stage=args.stage,
-            config=args.config,
-            out=args.out,
-            overrides=tuple(overrides),
-            shard=args.shard,
-            engine=args.engine,
-            dry_run=args.dry_run,
-            command=("run_pipeline", *arguments),
-        )
+    request = Request(
+        stage=args.stage,
+        config=args.config,
+        out=args.out,
+        overrides=tuple(overrides),
+        shard=args.shard,
+        engine=args.engine,
+        dry_run=args.dry_run,
+        command=("run_pipeline", *arguments),
     )
+    if args.json is None:
+        return carry_out(request)
+    record: dict[str, Any] = {}
+    with contextlib.redirect_stdout(sys.stderr if args.json == "-" else sys.stdout):
+        code = carry_out(request, record)
+    text = json.dumps({"exit_code": code, **record}, indent=1)
+    if args.json == "-":
+        print(text)
+    else:
+        write_text(Path(args.json), text + "\n")
+    return code
 
 
 if __name__ == "__main__":

@@ -5,8 +5,9 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from pipeline.config import Config, dump_config, load_config
 from pipeline.data import Dataset
@@ -20,7 +21,7 @@ from pipeline.runner.processes import available_cores
 from pipeline.runner.signals import StopRequest, stop_on_signals
 from pipeline.settings import nearest_name
 from pipeline.stages import FRAME_STAGES, STAGES, data_root, frame_stages_for, has_points, open_frames
-from pipeline.summary import print_dry_run, print_results, print_summary
+from pipeline.summary import print_dry_run, print_results, print_summary, run_record
 from pipeline.versions import made_with
 
 DONE, SOME_FAILED, REFUSED = 0, 1, 2
@@ -46,26 +47,34 @@ class Request:
     command: tuple[str, ...] = field(default=("run_pipeline",))
 
 
-def carry_out(request: Request) -> int:
-    """Runs the stages of a request. Returns the exit code; raises UsageError when it cannot be carried out."""
+def carry_out(request: Request, record: dict[str, Any] | None = None) -> int:
+    """Runs the stages of a request. Returns the exit code; raises UsageError when it cannot be carried out.
+
+    record  is filled with what became of it, as plain values (`--json`)
+    """
+    record = {} if record is None else record
     out = Path(request.out) if request.out else default_out(request.config)
     config = load_config(config_source(request, out), request.overrides)
     run = RunFolder(out)
     stage = request.stage or "report"
     check_request(request, stage)
+    record |= {"run": str(run.root), "stage": stage}
     if request.dry_run:
-        return dry_run(config, run, stage, request.shard)
+        record["estimates"] = dry_run(config, run, stage, request.shard)
+        return DONE
     prepare_folder(run, config)
     make_data(config, run, stage, request.shard)
     if stage == "synth":
-        print(f"synthetic data: {data_root(config, run)}")
+        record["data"] = str(data_root(config, run))
+        print(f"synthetic data: {record['data']}")
         return DONE
     with stop_on_signals() as stop:
-        code = run_batch(request, config, run, stage, stop)
+        code = run_batch(request, config, run, stage, stop, record)
     if stage == "train" and code == DONE:
         from pipeline.training import train_stage
 
-        print(f"weights: {train_stage(config, run)}")
+        record["weights"] = str(train_stage(config, run))
+        print(f"weights: {record['weights']}")
     return code
 
 
@@ -132,8 +141,8 @@ def make_data(config: Config, run: RunFolder, stage: str, shard: tuple[int, int]
     make_synthetic_data(config, root)
 
 
-def dry_run(config: Config, run: RunFolder, stage: str, shard: tuple[int, int] | None) -> int:
-    """Prints what would be done; writes nothing but the ledger of a run that exists."""
+def dry_run(config: Config, run: RunFolder, stage: str, shard: tuple[int, int] | None) -> list[dict[str, Any]]:
+    """Prints what would be done, and gives it; writes nothing but the ledger of a run that exists."""
     from pipeline.runner.estimate import estimate, estimate_batch
 
     workers = config.run.workers or available_cores()
@@ -151,10 +160,12 @@ def dry_run(config: Config, run: RunFolder, stage: str, shard: tuple[int, int] |
         frames = len(shard_of(dataset.ids, shard))
         estimates = [estimate(name, frames, workers, None) for name in stages_to_run(stage, config, dataset)]
     print_dry_run(estimates, run, config)
-    return DONE
+    return [asdict(item) for item in estimates]
 
 
-def run_batch(request: Request, config: Config, run: RunFolder, stage: str, stop: StopRequest) -> int:
+def run_batch(
+    request: Request, config: Config, run: RunFolder, stage: str, stop: StopRequest, record: dict[str, Any]
+) -> int:
     """The frame stages, then the scores and the report when they are asked for."""
     batch = open_batch(config, run, request.shard, stop, request.engine)
     try:
@@ -169,6 +180,7 @@ def run_batch(request: Request, config: Config, run: RunFolder, stage: str, stop
         from pipeline.report.page import write_report
 
         write_report(config, run, batch.dataset, batch.frames)
+    record |= run_record(run, stage, summaries, failures, stopped=bool(stop()))
     return conclude(request, run, stage, stop, summaries, bool(failures))
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
 from pipeline.config import Config
 from pipeline.paths import RunFolder
@@ -55,6 +56,21 @@ def print_summary(summaries: Sequence[StageSummary]) -> None:
     if rows:
         header = ["stage", "done", "up to date", "failed", "left out", "not reached", "per frame", "work"]
         print_table("Frames", header, rows)
+
+
+def run_record(
+    run: RunFolder, stage: str, summaries: Sequence[StageSummary], failures: Sequence[Any], stopped: bool
+) -> dict[str, Any]:
+    """What `--json` says of a run: counts per stage, where the results lie, and the scores when they were made."""
+    record: dict[str, Any] = {
+        "stopped": stopped,
+        "stages": [asdict(item) | {"left": item.left} for item in summaries],
+        "failures": str(run.failures) if failures else None,
+    }
+    if stage in ("evaluate", "report") and not stopped:
+        record["metrics"] = json.loads(run.metrics.read_text(encoding="utf-8"))
+        record["report"] = str(run.report) if stage == "report" else None
+    return record
 
 
 def print_results(run: RunFolder) -> None:

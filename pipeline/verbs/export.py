@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 from pipeline.errors import UsageError
@@ -34,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--compat", default="", metavar="NAME,...", help=f"consumers' quirks to reproduce. {quirks}")
     parser.add_argument("--images", action="store_true", help="also write the colour images")
     parser.add_argument("--workers", type=int, metavar="N", help="processes (all cores)")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of text")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -57,6 +60,9 @@ def run(args: argparse.Namespace) -> int:
     options = Options(args.virtual, compat, args.images)
     workers = args.workers or default_workers(len(dataset))
     summary = export(dataset, args.run, args.out, args.format, options, workers)
+    if args.json:
+        print(json.dumps({"out": str(args.out)} | asdict(summary), indent=1, default=str))
+        return 1 if summary.failures else 0
     numbers = [f"{summary.frames} frames", *(f"{count} {name}" for name, count in summary.counts.items())]
     numbers += [f"largest {name} {value:.3g}" for name, value in summary.largest.items()]
     print(f"{args.out}: {', '.join(numbers)}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     out = "NAME.safetensors, or the folder of result files"
     parser.add_argument("--out", type=Path, required=True, metavar="FILE|DIR", help=out)
+    parser.add_argument("--json", action="store_true", help="print JSON instead of text")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -31,12 +33,14 @@ def run(args: argparse.Namespace) -> int:
     if not args.path.is_file():
         raise UsageError(f"no such file: {args.path}")
     if args.architecture == "results":
-        print(f"{args.out}: {import_results(args.path, args.out)} result files")
+        count = import_results(args.path, args.out)
+        print(json.dumps({"out": str(args.out), "files": count}) if args.json else f"{args.out}: {count} result files")
         return 0
     if args.out.suffix != ".safetensors":
         raise UsageError(f"--out {args.out}: expected a name that ends in .safetensors")
     written = import_weights(args.path, args.architecture, args.out)
-    print(f"{written} and {written.with_suffix('.json').name}")
+    card = written.with_suffix(".json")
+    print(json.dumps({"weights": str(written), "card": str(card)}) if args.json else f"{written} and {card.name}")
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
 
@@ -22,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"frames of the test split, numbered from 0 ({TEST_FRAMES})",
     )
+    parser.add_argument("--json", action="store_true", help="print JSON instead of text")
     parser.add_argument("--fill-missing", action="store_true", help="add empty files for frames without a result file")
 
 
@@ -29,6 +31,8 @@ def run(args: argparse.Namespace) -> int:
     """Check and pack; 0 written, 2 refused (every reason on stderr)."""
     folder = Path(args.detections)
     errors, warnings = check_submission(folder, args.test_frames, args.fill_missing)
+    if args.json and errors:
+        print(json.dumps({"archive": None, "errors": errors, "warnings": warnings}, indent=1))
     for message in warnings:
         print(f"warning: {message}", file=sys.stderr)
     if errors:
@@ -38,6 +42,9 @@ def run(args: argparse.Namespace) -> int:
             print(f"error: ... and {len(errors) - _SHOWN} more", file=sys.stderr)
         return 2
     archive = write_archive(folder, Path(args.archive), args.test_frames)
+    if args.json:
+        print(json.dumps({"archive": str(archive), "errors": [], "warnings": warnings}, indent=1))
+        return 0
     print(f"{archive}: {args.test_frames} result files at the root, {archive.stat().st_size / 1e6:.1f} MB")
     return 0
 
