@@ -41,6 +41,7 @@ API: dict[str, tuple[str, ...]] = {
 STYLE = """\
 .language-text code, .language-sh code, .language-bash code { white-space: pre-wrap; overflow-wrap: anywhere; }
 .md-typeset img { background: white; border-radius: 4px; }
+.md-typeset img[src$="webp"] { border: 1px solid var(--md-default-fg-color--lightest); }
 .md-typeset table code { word-break: normal; overflow-wrap: break-word; }
 @media (max-width: 40em) {
   .md-typeset table:not([class]) th, .md-typeset table:not([class]) td { padding: 0.4em 0.5em; min-width: 0; }

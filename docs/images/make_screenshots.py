@@ -31,14 +31,8 @@ def main() -> int:
         save(page, "report_maps", "article:nth-of-type(2) .maps")
         page.run(f"document.head.insertAdjacentHTML('beforeend', '<style>{ONE_FRAME}</style>')")
         save(page, "report_frame", "article:nth-of-type(2)")
-        phone = browser.open(address, 390, 844, phone=True, dark=True)
-        open_cloud(phone, 2)
-        phone.run("document.querySelector('article:nth-of-type(2)').scrollIntoView()")
-        phone.settle(1)
-        save(phone, "report_phone", "article:nth-of-type(2)", height=844)
-        problems = [*page.errors, *phone.errors]
-    print("\n".join(problems) or "no console errors")
-    return 1 if problems else 0
+    print("\n".join(page.errors) or "no console errors")
+    return 1 if page.errors else 0
 
 
 def made_run() -> Path:
@@ -62,8 +56,7 @@ def save(page: Page, name: str, selector: str | None, height: int | None = None)
     with tempfile.TemporaryDirectory() as folder:
         shot = page.picture(Path(folder) / "shot.png", selector)
         with Image.open(shot) as picture:
-            scale = picture.width / page.width if selector is None else 2 if page.width < 600 else 1
-            rows = picture.height if height is None else min(picture.height, round(height * scale))
+            rows = picture.height if height is None else min(picture.height, height)
             target = FOLDER / f"{name}.webp"
             picture.convert("RGB").crop((0, 0, picture.width, rows)).save(target, quality=QUALITY, method=6)
     print(f"{target.name}: {target.stat().st_size / 1000:.0f} kB")

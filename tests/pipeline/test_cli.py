@@ -373,3 +373,23 @@ def test_verbs_have_their_own_help(options: list[str], capsys) -> None:
         main(options)
     assert end.value.code == 0
     assert "usage: run_pipeline --stage" in capsys.readouterr().out
+
+
+def test_json_says_how_a_run_went(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    words = ["--config", "kitti", "--data", str(data), "--out", str(out), "--stage", "complete", "--workers", "1"]
+    words += ["--set", "completion.model=classical"]
+    assert main([*words, "--dry-run", "--json"]) == 0
+    (estimate,) = json.loads(capsys.readouterr().out)["estimates"]
+    assert (estimate["stage"], estimate["measured"]) == ("complete", False)
+    assert main([*words, "--json"]) == 0
+    shown = capsys.readouterr()
+    record = json.loads(shown.out)
+    (stage,) = record["stages"]
+    assert stage["done"] == stage["total"] == estimate["frames"]
+    assert (record["exit_code"], record["run"], record["failures"]) == (0, str(out), None)
+    assert "Frames" in shown.err
+    assert main([*words, "--json", str(tmp_path / "result.json")]) == 0
+    (again,) = json.loads((tmp_path / "result.json").read_text())["stages"]
+    assert (again["done"], again["up_to_date"]) == (0, stage["total"])
+    assert "Frames" in capsys.readouterr().out
