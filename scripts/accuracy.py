@@ -44,7 +44,7 @@ def table(real: dict[str, Any]) -> list[str]:
     names = detector_name(augmented), detector_name(raw)
     network = augmented.completion.model
     frames = f"{real['frames']} real KITTI frames"
-    rows = ["| measured | on | ours | beside it |", "|---|---|---|---|"]
+    rows = ["| measured | on | embedded networks | for comparison |", "|---|---|---|---|"]
     for count in (32, 16):
         ours, linear = depth_row(real, network, count), depth_row(real, "linear_inverse", count)
         if ours and linear:
@@ -62,13 +62,13 @@ def table(real: dict[str, Any]) -> list[str]:
             "{} of {}".format(*row["found"]["moderate"]) + f", precision {row['precision']:.2f}" for row in found if row
         ]
         where = f"{frames}, moderate, from above at IoU 0.5"
-        rows.append(f"| cars found | {where} | {cells[0]} | raw LiDAR {cells[1]} |")
+        rows.append(f"| cars found | {where} | augmented {cells[0]}; raw LiDAR {cells[1]} | |")
     held = [held_out(name) for name in names]
     for kind, iou in (("Car", 0.7), ("Pedestrian", 0.5), ("Cyclist", 0.5)):
         values = [record["ap_r40"].get(f"{kind} 3d {iou}", [None, None])[1] for record in held]
         if None not in values:
             where = f"{held[0]['frames']} held-out synthetic frames, moderate, IoU {iou}"
-            rows.append(f"| {kind} 3D AP R40 | {where} | {values[0]:.1f} | raw LiDAR {values[1]:.1f} |")
+            rows.append(f"| {kind} 3D AP R40 | {where} | augmented {values[0]:.1f}; raw LiDAR {values[1]:.1f} | |")
     return rows
 
 

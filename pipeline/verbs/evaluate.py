@@ -155,15 +155,20 @@ def _class_ious(texts: Sequence[str]) -> dict[str, list[float]]:
 
 
 def _named_folders(compare: Sequence[str], baseline: str) -> list[tuple[str, str]]:
-    """(name, folder) of every --compare; the name is the folder's where none is given."""
+    """(name, folder) of every --compare; without a name, the folder's, or the run's whose `detections` it is."""
     named = []
     for text in compare:
         name, separator, folder = text.partition("=")
-        named.append((name, folder) if separator else (Path(text).name, text))
-    names = [name for name, _ in named] + [Path(baseline).name]
+        named.append((name, folder) if separator else (_folder_name(text), text))
+    names = [name for name, _ in named] + [_folder_name(baseline)]
     if len(set(names)) != len(names):
         raise ValueError(f"--compare: two result folders are called the same ({', '.join(names)}); use NAME=DIR")
     return named
+
+
+def _folder_name(folder: str) -> str:
+    path = Path(folder).absolute()
+    return path.parent.name if path.name == "detections" else path.name
 
 
 def _resample(
@@ -180,7 +185,7 @@ def _resample(
     print(interval_table(intervals, resampling.confidence), file=screen)
     found: dict[str, Any] = {"resampling": asdict(resampling), "intervals": [_flat(item) for item in intervals]}
     if others:
-        differences = paired_differences({Path(args.detections).name: evaluation, **others}, resampling)
+        differences = paired_differences({_folder_name(args.detections): evaluation, **others}, resampling)
         print(difference_table(differences, resampling.confidence), file=screen)
         found["differences"] = [_flat(item) for item in differences]
     return found
