@@ -13,6 +13,7 @@ from pipeline.experiments.tables import HIGHER, Claim, Column, RankClaim, Row, T
 
 CONFIDENCE = 0.95
 RESAMPLES = 2000
+ONE_TRAINING = "paired bootstrap of two single trainings"
 HOLDS, PERHAPS, FAILS, UNKNOWN = "holds", "undecided", "does not hold", "not run"
 
 
@@ -124,7 +125,7 @@ def margin(
     if draws[0] and len(draws[0]) == len(draws[1]):
         paired = sign * (np.asarray(draws[0], np.float64) - np.asarray(draws[1], np.float64))
         low, high = np.percentile(paired, [50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE)])
-        return Estimate(differences[0], float("nan"), float(low), float(high), "paired bootstrap of the runs")
+        return Estimate(differences[0], float("nan"), float(low), float(high), ONE_TRAINING)
     if len(frames[0]) == len(frames[1]):
         low, high = over_frames(sign * (frames[0] - frames[1]))
     return Estimate(differences[0], float("nan"), low, high, "paired bootstrap over frames")
@@ -143,12 +144,15 @@ def _judge_order(claim: Claim, table: Table, outcomes: Mapping[str, Sequence[Out
             interval = (
                 f" [{found.low:+.{column.digits}f}, {found.high:+.{column.digits}f}]" if found.low == found.low else ""
             )
-            lines.append(f"{better} ahead of {worse} by {found.mean:+.{column.digits}f}{interval}")
+            only = " over test frames, one training each" if found.how == ONE_TRAINING else ""
+            lines.append(f"{better} ahead of {worse} by {found.mean:+.{column.digits}f}{interval}{only}")
     worst = FAILS if FAILS in verdicts else PERHAPS if PERHAPS in verdicts else HOLDS
     return Verdict(claim.text, worst, "; ".join(lines))
 
 
 def _sign(found: Estimate) -> str:
+    if found.how == ONE_TRAINING:  # the scatter between trainings is not known
+        return PERHAPS
     if found.low > 0:
         return HOLDS
     return FAILS if found.high < 0 else PERHAPS

@@ -17,7 +17,7 @@ from pipeline.experiments.catalogue import find
 from pipeline.experiments.chapter_5_findings import FINDINGS
 from pipeline.experiments.cloud_runs import picked_by_fps
 from pipeline.experiments.findings import markdown as findings_page
-from pipeline.experiments.intervals import margin
+from pipeline.experiments.intervals import HOLDS, PERHAPS, judge, margin
 from pipeline.experiments.outputs import markdown, write_outputs
 from pipeline.experiments.plan import Order, TableResult, carry_out, gather, make_plan
 from pipeline.experiments.runs import Outcome
@@ -180,6 +180,12 @@ def test_single_runs_are_compared_by_paired_draws() -> None:
     found = margin(table, "bev_0.5_moderate", "semantic", "all", outcomes)
     assert found is not None
     assert (found.mean, found.low, found.high) == (10, 10, 10)
+    # One training each decides nothing, however sure the frames are.
+    verdict = judge(table, outcomes)[0]
+    assert verdict.verdict == PERHAPS
+    assert verdict.evidence.endswith("by +10.0 [+10.0, +10.0] over test frames, one training each")
+    twice = {label: [Outcome(one[0].numbers), Outcome(one[0].numbers)] for label, one in outcomes.items()}
+    assert judge(table, twice)[0].verdict == HOLDS
 
 
 def test_fps_keeps_the_far_points() -> None:
