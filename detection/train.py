@@ -6,9 +6,7 @@ been. Several processes (torchrun, or `train_in_processes`) average their gradie
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 import json
 import os
 import time
@@ -32,7 +30,7 @@ from detection.augment import (
     cut_objects,
     paste_objects,
 )
-from detection.checkpoints import load_checkpoint, load_tensors, save_checkpoint, save_tensors, write_atomically
+from detection.checkpoints import load_checkpoint, load_tensors, save_checkpoint, save_tensors
 from detection.inputs import CameraCloud, camera_cloud, ground_height, network_input, truth_boxes
 from detection.kitti_format import KittiObject, boxes_of
 from detection.lidar_inputs import lidar_boxes, lidar_rows, turned_boxes, turned_cloud
@@ -42,6 +40,7 @@ from detection.models.layers import set_batchnorm_momentum
 from detection.models.presets import PRESETS, Preset
 from detection.models.warm_start import copy_matching
 from detection.optimiser import AdamOneCycle, OneCycleSettings, batchnorm_momentum
+from detection.training_log import TrainingLog
 from detection.types import PointFrame
 
 
@@ -307,41 +306,6 @@ def _settings_text(settings: TrainSettings, processes: int) -> str:
     return json.dumps({**values, "processes": processes}, sort_keys=True)
 
 
-class _Log:
-    """log.csv of a run, and TensorBoard when it is installed."""
-
-    def __init__(self, folder: Path, done: int) -> None:
-        self.path = folder / "log.csv"
-        rows = list(csv.reader(io.StringIO(self.path.read_text()))) if self.path.is_file() else []
-        self.header = rows[0] if rows else []
-        # Rows written after the last saved state are written again.
-        kept = [row for row in rows if row and (row[0] == "step" or int(row[0]) <= done)]
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows(kept)
-        write_atomically(self.path, text.getvalue().encode())
-        self.board = _tensorboard(folder)
-
-    def write(self, step: int, values: dict[str, float]) -> None:
-        """Append one row."""
-        with self.path.open("a", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            if not self.header:
-                self.header = ["step", *values]
-                writer.writerow(self.header)
-            writer.writerow([step, *(f"{values[name]:.6g}" for name in self.header[1:])])
-        if self.board is not None:
-            for name, value in values.items():
-                self.board.add_scalar(name, value, step)
-
-
-def _tensorboard(folder: Path) -> Any:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        return None
-    return SummaryWriter(str(folder / "tensorboard"))
-
-
 def train(
     settings: TrainSettings,
     samples: LabelledFrames,
@@ -362,7 +326,7 @@ def train(
     state = folder / "state.safetensors"
     done = trainer.resume(state)
     is_first = trainer.workers.rank == 0
-    log = _Log(folder, done) if is_first else None
+    log = TrainingLog(folder, done) if is_first else None
     sums: dict[str, float] = {}
     started = last = time.perf_counter()
     for step in range(done, settings.steps):
