@@ -40,7 +40,8 @@ def small(
         name="small",
         classes=classes,
         inputs=InputSettings(points, "balanced", features, cloud=60000),
-        outputs=OutputSettings(0.1, 0.1, probability=True, mirrored_pass=True, vote_iou=0.5),
+        # No camera sees fifty objects of a class; what an unsure network adds to them is noise.
+        outputs=OutputSettings(0.1, 0.1, probability=True, mirrored_pass=True, vote_iou=0.5, limit=50),
         build=lambda: CompactPointRCNN(settings),
         options={"features": list(features), "points": points, "width": width, "classes": list(classes)},
         skip_empty_frames=False,
