@@ -227,7 +227,8 @@ def test_eight_frames_are_learned_by_heart(tmp_path) -> None:
         options={"points": 3072, "width": 0.5},
         steps=650,
         scene=None,
-        optimiser=OneCycleSettings(peak=0.01),
+        # At 0.01 the outcome is a matter of rounding (AP 66 to 100).
+        optimiser=OneCycleSettings(peak=0.006),
         save_every=1000,
     )
     try:
