@@ -19,10 +19,8 @@ from pipeline.benchmark.car_recall import CarReport, car_recall
 from pipeline.benchmark.held_out_rings import ROW_STEPS, hold_out, score
 from pipeline.benchmark.peers import PEERS
 from pipeline.data import Dataset, Frame
-from pipeline.pointcloud.augment import augment_frame
 from pipeline.pointcloud.presets import PRESETS
-from pipeline.runner.seeds import derive_seed
-from pipeline.simulation.lidar_rows import subsample_rows
+from pipeline.training_clouds import thinned_cloud
 
 Progress = Callable[[str], None]
 IOUS = (0.5, 0.7)
@@ -108,15 +106,8 @@ def detection_scores(dataset: Dataset, rows: Iterable[DetectionRow], completer: 
 
 def augmented_points(frame: Frame, row: DetectionRow, complete: Completer) -> NDArray[np.float32]:
     """The cloud of a row: raw points, or the preset's augmented cloud; (N, 4 or 5) LiDAR frame."""
-    points = frame.points if row.rows == 64 else subsample_rows(frame.points, 64 // row.rows)
-    if row.preset == "L":
-        return points
-    from pipeline.data.projection import project_points
-
-    sparse = project_points(points, frame.calibration, frame.image_size)
-    completed = complete.complete(sparse, frame.image)
-    seed = derive_seed(0, frame.id, "augment")
-    return augment_frame(completed, points, frame.calibration, PRESETS[row.preset], None, seed).points
+    settings = None if row.preset == "L" else PRESETS[row.preset]
+    return thinned_cloud(frame, 64 // row.rows, settings, complete, seed=0)
 
 
 def _reports(
