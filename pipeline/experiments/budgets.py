@@ -20,6 +20,8 @@ class CompletionBudget:
     channels     width of MultiStack and TWISE; resnet_width: of the ResNet's first layer (published: 64 and 64)
     bins         depth bins of Depth Coefficients over 0 to 80 m (published: 80)
     init, rgb    initialisation and colour scaling; published: "xavier", "unit" (see docs/completion.md)
+    depth_unit   metres per unit of the networks' depth, except that of coefficients; 0: each network's own (published:
+                 80 for twin surfaces, 1 for the others; in units of 80 m sigma needs far longer to learn anything)
     steps        optimiser steps; batch: crops of a step
     schedule     "cosine", or "halving" every sixth of the run (published)
     seconds_per_step, seconds_per_test_frame   on MACHINE, by network; seconds_per_data_frame: of making a frame
@@ -42,6 +44,7 @@ class CompletionBudget:
     init: str = "he"
     rgb: str = "standardised"
     schedule: str = "cosine"
+    depth_unit: float = 0.0
     data_seed: int = 40
     seconds_per_step: Mapping[str, float] = field(default_factory=dict)
     seconds_per_test_frame: Mapping[str, float] = field(default_factory=dict)
@@ -70,7 +73,7 @@ COMPLETION: dict[str, CompletionBudget] = {
     ),
     "small": CompletionBudget(
         train_frames=72, test_frames=24, size=(188, 620), crop=(96, 192), test_rows=144, test_columns=384, channels=8,
-        resnet_width=8, bins=40, steps=240, batch=1, learning_rate=3e-3, seconds_per_step=_SMALL[0],
+        resnet_width=8, bins=40, steps=800, batch=1, learning_rate=3e-3, depth_unit=1.0, seconds_per_step=_SMALL[0],
         seconds_per_test_frame=_SMALL[1], seconds_per_data_frame=2.0,
     ),
     "paper": CompletionBudget(

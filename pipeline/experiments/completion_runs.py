@@ -122,6 +122,8 @@ def model_spec(recipe: Recipe, budget: CompletionBudget) -> ModelSpec:
         if "dc" in name:
             arguments |= {"count": budget.bins, "size": 80.0 / budget.bins}
     spec = default_spec(name, **arguments)
+    if budget.depth_unit and spec.output != "coefficients":
+        spec = replace(spec, depth_unit=float(budget.depth_unit))
     return with_rgb(spec, budget.rgb) if budget.rgb != "unit" else spec
 
 

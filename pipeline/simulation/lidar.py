@@ -18,6 +18,17 @@ from pipeline.simulation.tracing import Tracer
 
 AZIMUTH_STEP = 0.17
 MIN_RANGE, MAX_RANGE = 1.45, 80.0
+# What the recording car hides from the HDL-64E, as measured in KITTI's object frames: (first and last azimuth, lowest
+# and highest elevation), degrees, left of forward. The tail with the roof rack, a mast on the right, the bonnet, and
+# the rack's corners. The image (within 41 degrees of forward, above -14) sees none of it.
+KITTI_CAR = (
+    (154.0, 202.0, -90.0, -18.1),
+    (281.0, 300.0, -21.4, -16.1),
+    (-10.0, 10.0, -90.0, -20.5),
+    (10.0, 22.0, -90.0, -22.4),
+    (128.0, 142.0, -90.0, -21.4),
+    (226.0, 238.0, -90.0, -22.0),
+)
 
 
 @dataclass(frozen=True)
@@ -28,6 +39,7 @@ class Sensor:
     azimuth_step degrees between firings
     range_noise  standard deviation of one range in metres; ring_bias: of the error a laser keeps for a whole scan
     loss         probability that a good pulse is lost
+    hidden       sectors that the carrying car hides, as KITTI_CAR
     """
 
     elevations: NDArray[np.float64]
@@ -35,6 +47,7 @@ class Sensor:
     range_noise: float = 0.016
     ring_bias: float = 0.012
     loss: float = 0.01
+    hidden: tuple[tuple[float, float, float, float], ...] = ()
 
 
 def _hdl64e() -> NDArray[np.float64]:
@@ -53,7 +66,7 @@ def sensor(rows: int) -> Sensor:
     }
     if rows not in patterns:
         raise ValueError(f"rows: expected one of {sorted(patterns)}, got {rows}")
-    return Sensor(patterns[rows])
+    return Sensor(patterns[rows], hidden=KITTI_CAR if rows == 64 else ())
 
 
 def beam_directions(sensor: Sensor, rng: np.random.Generator) -> tuple[NDArray[np.float64], tuple[int, int]]:
@@ -92,11 +105,21 @@ def scan(
     )
     ring = np.repeat(np.arange(grid[0]), grid[1])
     reach = reach + rng.normal(0, sensor.ring_bias, grid[0])[ring] + rng.normal(0, sensor.range_noise, len(reach))
-    returned &= np.isfinite(reach) & (reach > MIN_RANGE) & (reach < MAX_RANGE)
+    returned &= np.isfinite(reach) & (reach > MIN_RANGE) & (reach < MAX_RANGE) & ~_hidden(directions, sensor)
     points = directions[returned] * reach[returned, None]
     echo = intensity(reflectance[returned], cosine[returned], reach[returned], rng)
     # KITTI's files hold millimetres and hundredths.
     return np.column_stack([np.round(points, 3), echo]).astype(np.float32)
+
+
+def _hidden(directions: NDArray[np.float64], sensor: Sensor) -> NDArray[np.bool_]:
+    """(N,) whether the carrying car is in the way of each of (N, 3) unit directions."""
+    azimuth = np.degrees(np.arctan2(directions[:, 1], directions[:, 0]))
+    elevation = np.degrees(np.arcsin(directions[:, 2]))
+    hidden = np.zeros(len(directions), dtype=bool)
+    for first, last, lowest, highest in sensor.hidden:
+        hidden |= ((azimuth - first) % 360 <= last - first) & (elevation >= lowest) & (elevation <= highest)
+    return hidden
 
 
 def _first_returns(
