@@ -67,8 +67,8 @@ def _frame(frame_id: str, where: Path, image: Callable[[], Any], depth: Callable
     return Frame(frame_id, loaders, str(where))
 
 
-def _h5_array(path: Path, name: str, index: int | None) -> NDArray[Any]:
-    """One array of an HDF5 file (one row of it with `index`). Raises UsageError without h5py, DataError on damage."""
+def _h5_read(path: Path, name: str, read: Callable[[Any], Any]) -> Any:
+    """What `read` takes from one array of an HDF5 file. UsageError without h5py, DataError on damage."""
     try:
         import h5py
     except ModuleNotFoundError:
@@ -77,16 +77,18 @@ def _h5_array(path: Path, name: str, index: int | None) -> NDArray[Any]:
         with h5py.File(path, "r") as file:
             if name not in file:
                 raise DataError(path, f"an array '{name}'", ", ".join(file) or "an empty file")
-            return np.asarray(file[name][()] if index is None else file[name][index])
+            return read(file[name])
     except OSError as error:
         raise DataError(path, "an HDF5 file", str(error)) from None
 
 
-def _labelled_count(path: Path) -> int:
-    import h5py
+def _h5_array(path: Path, name: str, index: int | None) -> NDArray[Any]:
+    """One array of an HDF5 file (one row of it with `index`)."""
+    return np.asarray(_h5_read(path, name, lambda array: array[() if index is None else index]))
 
-    with h5py.File(path, "r") as file:
-        return int(file["images"].shape[0])
+
+def _labelled_count(path: Path) -> int:
+    return int(_h5_read(path, "images", lambda array: array.shape[0]))
 
 
 def _open_labelled(path: Path, frame_id: str) -> Frame:

@@ -166,10 +166,13 @@ def draw_error_maps(result: TableResult, figure: Any) -> None:
     """Fig. 4.9: image above, absolute error from 0 to 5 m below, a line per network."""
     import numpy as np
 
-    axes = figure.subplots(1 + len(result.outcomes), 2, squeeze=False)
-    for line, label in enumerate(result.outcomes, start=1):
-        with np.load(result.folders[label][0] / "examples.npz") as examples:
-            for column in range(2):
+    files = {label: result.folders[label][0] / "examples.npz" for label in result.outcomes}
+    with np.load(next(iter(files.values()))) as examples:
+        frames = sum(name.startswith("image_") for name in examples.files)  # one where only one was tested
+    axes = figure.subplots(1 + len(files), frames, squeeze=False)
+    for line, (label, path) in enumerate(files.items(), start=1):
+        with np.load(path) as examples:
+            for column in range(frames):
                 target = examples[f"clean_{column}"].astype(np.float32)
                 error = np.abs(examples[f"depth_{column}"].astype(np.float32) - target)
                 axes[0, column].imshow(examples[f"image_{column}"])

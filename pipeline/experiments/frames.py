@@ -105,15 +105,20 @@ def open_any(root: Path) -> Dataset:
     """The data set in a folder, recognised by its folders. UsageError when it is none that has true depth."""
     from pipeline.data import open_dataset
 
-    signs = {"kitti_depth": "data_depth_annotated", "kitti_object": "training/depth_2", "vkitti2": "Scene20"}
-    for name, sign in signs.items():
-        if (root / sign).is_dir():
+    signs = (
+        ("kitti_depth", "data_depth_annotated"),
+        ("kitti_object", "training/depth_2"),
+        ("vkitti2", "Scene[0-9][0-9]"),
+        ("vkitti2", "vkitti_2.0.3_*"),
+        ("nyuv2", "*.mat"),
+        ("nyuv2", "**/*.h5"),
+    )
+    for name, sign in signs:
+        if any(root.glob(sign)):
             return open_dataset(name, root)
-    if any(root.glob("*.mat")) or any(root.rglob("*.h5")):
-        return open_dataset("nyuv2", root)
     raise UsageError(
         f"{root}: expected a data set with true depth (KITTI depth completion with data_depth_annotated/, KITTI object "
-        "with training/depth_2/, Virtual KITTI 2 with Scene20/, or NYU Depth v2), found none of them"
+        "with training/depth_2/, Virtual KITTI 2 with Scene01/ or another, or NYU Depth v2), found none of them"
     )
 
 

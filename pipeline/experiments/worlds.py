@@ -14,6 +14,7 @@ from detection.evaluation.objects import Array, Mask
 from pipeline.data import Dataset, open_dataset
 from pipeline.errors import UsageError
 from pipeline.runner.atomic import write_text
+from pipeline.runner.keys import code_version
 
 # One seed of the synthetic world for training frames, another for test frames.
 TRAIN_SEED, TEST_SEED = 1001, 2002
@@ -76,7 +77,8 @@ def world_identity(data: Path | None, train_frames: int, test_frames: int, size:
     """Plain values that decide which frames `open_world` gives."""
     frames = [train_frames, test_frames]
     if data is None:
-        return {"world": "synthetic", "seeds": [TRAIN_SEED, TEST_SEED], "frames": frames, "size": size}
+        world = code_version("pipeline/simulation")
+        return {"world": world, "seeds": [TRAIN_SEED, TEST_SEED], "frames": frames, "size": size}
     return {"folder": str(Path(data).resolve()), "frames": frames}
 
 
@@ -109,10 +111,11 @@ def synthetic_frames(
 ) -> Dataset:
     """`frames` synthetic frames of `seed` in KITTI's object layout with dense truth, written below `root` if missing.
 
-    A frame depends on seed, number and size alone, so a folder with more frames serves a smaller experiment.
+    A frame depends on seed, number, size and the world's code, so a folder with more frames serves a smaller experiment
+    and another version of the world has a folder of its own.
     """
     shape = "kitti" if size is None else f"{size[0]}x{size[1]}"
-    folder = root / f"frames-{seed}-{shape}"
+    folder = root / f"frames-{seed}-{shape}-{code_version('pipeline/simulation')[:8]}"
     missing = [index for index in range(frames) if not (folder / "written" / f"{index:06d}").is_file()]
     if missing:
         from pipeline.data.writers import write_job

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.data import open_dataset
 from pipeline.data.nyuv2 import open_nyuv2, open_nyuv2_full, sample_depth
-from pipeline.errors import UsageError
+from pipeline.errors import DataError, UsageError
 
 h5py = pytest.importorskip("h5py")
 
@@ -32,6 +32,12 @@ def test_labelled_mat(tmp_path: Path, scene: tuple[np.ndarray, np.ndarray]) -> N
     (frame,) = open_nyuv2_full(tmp_path)
     np.testing.assert_array_equal(frame.image, image)
     np.testing.assert_array_equal(frame.target_depth, depth)
+
+
+def test_a_labelled_mat_that_is_no_hdf5_is_named(tmp_path: Path) -> None:
+    (tmp_path / "nyu_depth_v2_labeled.mat").write_bytes(b"MATLAB 5.0 MAT-file")
+    with pytest.raises(DataError, match=r"nyu_depth_v2_labeled.mat: expected an HDF5 file"):
+        open_nyuv2_full(tmp_path)
 
 
 def test_h5_tree(tmp_path: Path, scene: tuple[np.ndarray, np.ndarray]) -> None:
