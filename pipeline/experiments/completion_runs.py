@@ -52,12 +52,13 @@ def data_identity(data: Path | None, budget: CompletionBudget) -> Any:
 def cost(recipe: Recipe, budget: CompletionBudget) -> Cost:
     """Steps and test frames by the measured seconds of the network; data once."""
     frames = budget.train_frames + budget.test_frames
-    once = {"data_seconds": frames * budget.seconds_per_data_frame, "data_bytes": frames * 13.0 * _pixels(budget)}
+    seconds, size = frames * budget.seconds_per_data_frame, frames * 13.0 * _pixels(budget)
     if "network" not in recipe.settings:
-        return Cost(budget.test_frames * 0.2, 1e6, **once)
+        return Cost(budget.test_frames * 0.2, 1e6, seconds, size)
     name = cost_name(recipe)
     train, test = budget.seconds_per_step.get(name, 0.0), budget.seconds_per_test_frame.get(name, 0.0)
-    return Cost(budget.steps * train + budget.test_frames * test, 5e6 * (budget.channels / 16) ** 2, **once)
+    training = budget.steps * train + budget.test_frames * test
+    return Cost(training, 5e6 * (budget.channels / 16) ** 2, seconds, size)
 
 
 def cost_name(recipe: Recipe) -> str:

@@ -35,6 +35,7 @@ class DetectionBudget:
 
     train_frames, test_frames   frames; size (height, width) of synthetic images, None for KITTI's own
     steps, batch   updates and clouds of each; peak of the one-cycle learning rate
+    start_steps    updates of the detector that every row begins with (`common_start.py`); 0: random weights (published)
     augmented      scene augmentation (flip, turn, scale); the thesis uses none (5.4.4)
     cloud_points   most points of a stored cloud; the thesis draws 50k of dense depth
     detectors      networks by the thesis' names
@@ -54,6 +55,7 @@ class DetectionBudget:
     detectors: Mapping[str, DetectorChoice]
     completer: str = "selection_small"
     masks: str = "truth"
+    start_steps: int = 0
     resamples: int = 300
     seconds_per_data_frame: float = 2.5
 
@@ -95,8 +97,8 @@ _PAPER = {
 }
 
 DETECTION: dict[str, DetectionBudget] = {
-    "smoke": DetectionBudget(2, 2, (96, 320), 2, 1, 0.004, False, 3000, _SMOKE, resamples=10),
-    "small": DetectionBudget(120, 60, None, 150, 2, 0.004, True, 30_000, _SMALL),
+    "smoke": DetectionBudget(2, 2, (96, 320), 2, 1, 0.004, False, 3000, _SMOKE, start_steps=2, resamples=10),
+    "small": DetectionBudget(160, 80, None, 150, 2, 0.004, True, 30_000, _SMALL, start_steps=2000),
     # 50 epochs of two clouds, no augmentation (thesis 5.4.4).
     "paper": DetectionBudget(3712, 3769, None, 92_800, 2, 0.002, False, 50_000, _PAPER, resamples=1000),
 }

@@ -7,7 +7,7 @@ Settings of a recipe: `input` (fields of `InputRecipe`), `detector` (a name in t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from detection.evaluation.bootstrap import Resampling
 from pipeline.errors import UsageError
 from pipeline.experiments import detection_scores as scores
 from pipeline.experiments.cloud_cache import CloudCache, DepthCache, short_hash
+from pipeline.experiments.common_start import Mixture, start_inputs
 from pipeline.experiments.detection_budget import DETECTION, DetectionBudget, DetectorChoice
 from pipeline.experiments.example import write_example
 from pipeline.experiments.inputs import InputRecipe
@@ -30,7 +31,7 @@ from pipeline.settings import nearest_name, plain, with_changes
 
 if TYPE_CHECKING:
     from detection.kitti_format import KittiObject
-    from detection.train import TrainProgress, TrainSettings
+    from detection.train import LabelledFrames, TrainProgress, TrainSettings
     from pipeline.data import Dataset
 
 BUDGETS: Mapping[str, DetectionBudget] = DETECTION
@@ -69,8 +70,9 @@ def cost(recipe: Recipe, budget: DetectionBudget) -> Cost:
     frames = budget.train_frames + budget.test_frames
     seconds = budget.steps * choice.seconds_per_step * budget.batch / 2 + budget.test_frames * choice.seconds_per_frame
     # Clouds are shared by seeds and detectors: a table has some six kinds of them.
-    shared = (5 * _MEGABYTE + 6 * 26.0 * budget.cloud_points) * frames
-    return Cost(seconds + 0.15 * frames, 5 * _MEGABYTE, budget.seconds_per_data_frame * frames, shared)
+    clouds = (5 * _MEGABYTE + 6 * 26.0 * budget.cloud_points) * frames
+    start = {choice.preset: budget.start_steps * choice.seconds_per_step * budget.batch / 2}
+    return Cost(seconds + 0.15 * frames, 5 * _MEGABYTE, budget.seconds_per_data_frame * frames, clouds, start)
 
 
 def detector_choice(recipe: DetectionRecipe, budget: DetectionBudget) -> DetectorChoice:
@@ -105,7 +107,7 @@ def run(recipe: Recipe, context: Context) -> Outcome:
     """Trains and tests one detector; continues from what a killed run left in its folder."""
     wanted = DetectionRecipe.of(recipe.settings)
     world = world_of(context)
-    weights = train_detector(wanted, clouds_of(world.train, wanted.train_input, context), context)
+    weights = train_detector(wanted, world.train, context)
     clouds = clouds_of(world.test, wanted.test_input, context)
     labels, detections = detect(weights, clouds, context)
     write_example(context.folder / "example.npz", clouds, labels, detections)
@@ -142,15 +144,28 @@ def train_settings(recipe: DetectionRecipe, context: Context) -> TrainSettings:
     )
 
 
-def train_detector(recipe: DetectionRecipe, clouds: CloudCache, context: Context) -> Path:
-    """Weights trained from the beginning or from the last saved state.
+def train_detector(recipe: DetectionRecipe, frames: Dataset, context: Context) -> Path:
+    """Weights for a recipe; runs that differ only in their test clouds share them."""
+    clouds = clouds_of(frames, recipe.train_input, context)
+    start = common_start(recipe.detector, frames, context) if context.budget.start_steps else None
+    return _trained(train_settings(recipe, context), clouds, [clouds.folder.name], start, context)
 
-    They lie in OUT/data/trained-HASH: runs that differ only in their test clouds share them.
-    """
+
+def common_start(detector: str, frames: Dataset, context: Context) -> Path:
+    """Weights that every row with this detector begins with, whatever its seed and input; trained once."""
+    sources = [clouds_of(frames, kind, context) for kind in start_inputs(frames[0])]
+    settings = train_settings(DetectionRecipe(detector, InputRecipe(), InputRecipe()), context)
+    settings = replace(settings, steps=context.budget.start_steps, seed=0)
+    return _trained(settings, Mixture(sources), [source.folder.name for source in sources], None, context)
+
+
+def _trained(
+    settings: TrainSettings, samples: LabelledFrames, clouds: list[str], start: Path | None, context: Context
+) -> Path:
+    """Weights in OUT/data/trained-HASH, trained from `start` (or nothing) or from the last saved state."""
     from detection.train import train
 
-    settings = train_settings(recipe, context)
-    record = [plain(settings), recipe.train_input.record(), clouds.folder.name, len(clouds)]
+    record = [plain(settings), clouds, len(samples), "" if start is None else start.parent.name]
     weights = context.out / "data" / f"trained-{short_hash(record)}" / "model.safetensors"
     if weights.is_file():
         return weights
@@ -159,7 +174,8 @@ def train_detector(recipe: DetectionRecipe, clouds: CloudCache, context: Context
         text = f"step {progress.step} of {progress.steps}, loss {progress.losses['loss']:.2f}"
         context.say(f"  {text}, {progress.seconds_per_step:.2f} s per step")
 
-    return train(settings, clouds, weights.parent, progress=report)
+    begun = settings if start is None else replace(settings, warm_start=str(start))
+    return train(begun, samples, weights.parent, progress=report)
 
 
 def detect(

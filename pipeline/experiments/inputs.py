@@ -74,6 +74,11 @@ class InputRecipe:
         """The depth that is needed: "completed" and the like, or None when only raw LiDAR is used."""
         return self.depth if self.settings.completed else None
 
+    def is_possible(self, frame: Frame) -> bool:
+        """Whether frames of this kind have what the recipe needs: scans ring by ring for fewer rows, true depth."""
+        depth_is_there = self.depth_name not in ("truth", "semi_dense") or frame.has("target_depth")
+        return depth_is_there and (self.rows == FULL_ROWS or _has_rings(frame))
+
     def record(self) -> dict[str, Any]:
         """Plain values that decide the points; what does not matter (the depth of raw LiDAR) is left out."""
         settings = self.settings
@@ -101,6 +106,11 @@ class InputCloud:
     counts: tuple[tuple[str, int, int], ...] = ()
 
 
+def _has_rings(frame: Frame) -> bool:
+    """Whether the frame has a scan in the sensor's order; that of Virtual KITTI 2 is drawn from its depth."""
+    return frame.has("points") and "/" not in frame.id
+
+
 def lidar_points(frame: Frame, rows: int) -> NDArray[np.float32]:
     """(N, 4) raw returns of every (64 / rows)-th ring. UsageError where the points are in no scan order."""
     from pipeline.simulation.lidar_rows import subsample_rows
@@ -109,7 +119,7 @@ def lidar_points(frame: Frame, rows: int) -> NDArray[np.float32]:
     points = lidar_of(frame)
     if rows == FULL_ROWS:
         return points
-    if not frame.has("points") or "/" in frame.id:
+    if not _has_rings(frame):
         raise UsageError(f"{frame.where}: {rows} LiDAR rows need scans ring by ring (KITTI, the synthetic world)")
     return subsample_rows(points, FULL_ROWS // rows)
 

@@ -107,9 +107,12 @@ def _column_values(table: Table, label: str, key: str, outcomes: Mapping[str, Se
 def margin(
     table: Table, key: str, better: str, worse: str, outcomes: Mapping[str, Sequence[Outcome]]
 ) -> Estimate | None:
-    """By how much `better` beats `worse` (positive: it does), paired by seed, or by frame when there is one seed."""
+    """By how much `better` beats `worse` (positive: it does), paired by seed, or by frame when there is one seed.
+
+    Seeds that one of the two rows lacks are left out.
+    """
     first, second = (_column_values(table, label, key, outcomes) for label in (better, worse))
-    if not first or len(first) != len(second) or not np.isfinite([*first, *second]).all():
+    if not first or not second or not np.isfinite([*first, *second]).all():
         return None
     column = table.column(key)
     sign = 1.0 if column.better == HIGHER else -1.0
@@ -170,10 +173,10 @@ def _judge_ranks(claim: RankClaim, table: Table, outcomes: Mapping[str, Sequence
     lists = [
         [_column_values(table, label, claim.column, outcomes) for label in side] for side in (claim.first, claim.second)
     ]
-    seeds = {len(values) for side in lists for values in side}
-    if len(seeds) != 1 or 0 in seeds or not np.isfinite(lists).all():
+    seeds = min(len(values) for side in lists for values in side)
+    first, second = (np.asarray([values[:seeds] for values in side]) for side in lists)
+    if not seeds or not np.isfinite([first, second]).all():
         return Verdict(claim.text, UNKNOWN, "")
-    first, second = np.asarray(lists[0]), np.asarray(lists[1])
     tau = kendall_tau(first.mean(1), second.mean(1))
     own = [kendall_tau(first[:, seed], second[:, seed]) for seed in range(first.shape[1])]
     evidence = f"Kendall's tau of the means {tau:.2f}; per seed {', '.join(f'{value:.2f}' for value in own)}"

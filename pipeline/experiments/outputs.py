@@ -60,12 +60,15 @@ def _printed(row: Row, index: int, column: Column) -> str:
 
 
 def status(row: Row, result: TableResult) -> str:
-    """Why a row has no numbers of ours; "" when it has."""
+    """Why a row has no numbers of ours, or of fewer seeds than asked for; "" when it has all."""
     if row.recipe is None:
         return row.reason
     if not available(row.recipe.kind):
         return "cannot be computed by this installation"
-    return "" if row.label in result.outcomes else "not run yet"
+    done, asked = len(result.outcomes.get(row.label, [])), len(result.folders.get(row.label, []))
+    if not done:
+        return "not run yet"
+    return f"{done} of {asked} seeds" if done < asked else ""
 
 
 def markdown(order: Order, result: TableResult) -> str:

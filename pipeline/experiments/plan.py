@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -92,12 +93,14 @@ def estimate_cost(runs: Sequence[Run]) -> Estimate:
     """Time and disk of these runs; what is made once per experiment folder counts once."""
     seconds, size = 0.0, 0.0
     shared: dict[str, tuple[float, float]] = {}
+    once: dict[str, float] = {}
     for run in runs:
         cost = kind_module(run.recipe.kind).cost(run.recipe, run.budget)
         seconds, size = seconds + cost.seconds, size + cost.bytes
         before = shared.get(run.recipe.kind, (0.0, 0.0))
         shared[run.recipe.kind] = (max(before[0], cost.data_seconds), max(before[1], cost.data_bytes))
-    seconds += sum(pair[0] for pair in shared.values())
+        once |= cost.shared
+    seconds += sum(pair[0] for pair in shared.values()) + sum(once.values())
     return Estimate(len(runs), seconds, size + sum(pair[1] for pair in shared.values()))
 
 
@@ -121,12 +124,12 @@ class TableResult:
 
 
 def gather(plan: Plan, table: Table) -> TableResult:
-    """The results of a table; a row with an unfinished seed has none."""
+    """The results of a table: of every row the seeds that are finished, up to the first that is not."""
     outcomes: dict[str, list[Outcome]] = {}
     for label, runs in plan.runs[table.name].items():
-        found = [read_result(run, plan.order.out) for run in runs]
-        done = [outcome for outcome in found if outcome is not None]
-        if len(done) == len(found):
+        found = (read_result(run, plan.order.out) for run in runs)
+        done = [outcome for outcome in takewhile(lambda outcome: outcome is not None, found) if outcome is not None]
+        if done:
             outcomes[label] = done
     folders = {label: [run.folder(plan.order.out) for run in runs] for label, runs in plan.runs[table.name].items()}
     return TableResult(table, outcomes, judge(table, outcomes), folders)

@@ -54,12 +54,16 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Cost:
-    """Estimate for one run: seconds on one core, bytes on disk; `data` seconds are spent once per experiment folder."""
+    """Estimate for one run: seconds on one core, bytes on disk; `data` seconds are spent once per experiment folder.
+
+    shared  further seconds that are spent once, by what is made
+    """
 
     seconds: float
     bytes: float = 0.0
     data_seconds: float = 0.0
     data_bytes: float = 0.0
+    shared: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,12 @@ import pytest
 from detection.evaluation.bootstrap import Resampling
 from detection.evaluation.difficulty import KittiDifficulty
 from detection.kitti_format import KittiObject
+from pipeline.data import Frame
 from pipeline.experiments import chapter_5, chapter_5_exact, chapter_5_figures, detection_scores
 from pipeline.experiments.catalogue import find
 from pipeline.experiments.chapter_5_findings import FINDINGS
 from pipeline.experiments.cloud_runs import picked_by_fps
+from pipeline.experiments.common_start import Mixture, start_inputs
 from pipeline.experiments.findings import markdown as findings_page
 from pipeline.experiments.intervals import HOLDS, PERHAPS, judge, margin
 from pipeline.experiments.outputs import markdown, write_outputs
@@ -199,3 +201,27 @@ def test_fps_keeps_the_far_points() -> None:
     assert len(many) == 64
     assert set(few) <= set(many)
     assert {500, 501, 502} <= set(few)
+
+
+def test_all_rows_begin_with_one_detector(out: Path, results: Callable[[str, str], TableResult]) -> None:
+    results("table", "5.8")
+    cards = [json.loads(path.read_text()) for path in (out / "data").glob("trained-*/model.json")]
+    starts = {card["training"]["warm_start"] for card in cards if card["training"]["preset"] == "small"}
+    (start,) = starts - {None}
+    assert Path(start).is_file()
+
+
+def test_the_common_start_sees_every_kind_of_cloud_equally_often() -> None:
+    kinds = [["L0", "L1"], ["D0", "D1"], ["L_D0", "L_D1"]]
+    mixture = Mixture(kinds)  # type: ignore[arg-type]
+    assert [mixture[index] for index in range(len(mixture))] == ["L0", "L1", "D0", "D1", "L_D0", "L_D1"]
+    with pytest.raises(IndexError, match="below 6"):
+        mixture[6]
+
+
+def test_the_common_start_uses_what_the_data_has() -> None:
+    scan, truth = {"points": lambda: None}, {"target_depth": lambda: None}
+    recipes = start_inputs(Frame("000001", {**scan, **truth}, "synthetic"))
+    assert len({json.dumps(recipe.record(), sort_keys=True) for recipe in recipes}) == len(recipes) == 9
+    assert {recipe.depth_name for recipe in start_inputs(Frame("000001", scan, "kitti"))} == {None, "completed"}
+    assert {recipe.rows for recipe in start_inputs(Frame("Scene01/clone/Camera_0/00000", truth, "vkitti2"))} == {64}
