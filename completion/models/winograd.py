@@ -1,0 +1,325 @@
+"""3x3 convolutions on the CPU with a quarter of the products: Winograd's F(4x4, 3x3), and what lies between them.
+
+Lavin and Gray, "Fast Algorithms for Convolutional Neural Networks", CVPR 2016. A tile of 4x4 outputs needs 6x6 inputs;
+each of 36 transformed places is an ordinary product with a matrix of weights: 2.25 products per output and pair of
+channels instead of 9. A direct convolution cannot beat the matrix product of a machine, this one can.
+
+The polynomials are evaluated at 0, +-a, +-b and infinity. The usual a = 1, b = 2 amplify rounding; with sqrt(1/2) and
+sqrt(2), whose product is one, errors stay about twice those of a direct float32 convolution.
+
+Maps are (H, W, C) float32 with the channels of a pixel together. Kernels work on a range of rows, release the
+interpreter and write every pixel of it, so that rows can be shared among threads and maps be reused.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from torch import Tensor
+
+Float = NDArray[np.float32]
+_A, _B = math.sqrt(0.5), math.sqrt(2)
+_POINTS = (0.0, _A, -_A, _B, -_B)
+_a, _b, _a2, _b2, _a3, _b3 = (np.float32(value) for value in (_A, _B, _A**2, _B**2, _A**3, _B**3))
+_SUM = np.float32(2.5)  # a^2 + b^2; a^2 b^2 is 1
+_ZERO, _ONE, _LOWEST = np.float32(0), np.float32(1), np.float32(-np.inf)
+# Tiles and pixels of a block: everything a block touches stays in the second-level cache, and products of this size
+# (64 channels) are below those for which BLAS libraries start threads of their own.
+TILES = 16
+PIXELS = 32
+
+
+def winograd_weights(weight: Tensor) -> Float:
+    """Weights (O, I, 3, 3) -> (36, I, O) for `convolve`; computed in float64."""
+    rows = []
+    for point in _POINTS:
+        scale = math.prod(point - other for other in _POINTS if other != point)
+        rows.append([power / scale for power in (1.0, point, point * point)])
+    rows.append([0.0, 0.0, 1.0])
+    transform = np.array(rows)
+    both = np.einsum("ia,jb,ocab->ijco", transform, transform, weight.detach().double().numpy())
+    return np.ascontiguousarray(both.reshape(36, *both.shape[2:]).astype(np.float32))
+
+
+@njit(inline="always")
+def _evaluated(x0, x1, x2, x3, x4, x5):  # type: ignore[no-untyped-def]
+    """One direction of the transform of inputs: six samples -> six points."""
+    e, o = x4 - _b2 * x2, _a * (x3 - _b2 * x1)
+    g, h = x4 - _a2 * x2, _b * (x3 - _a2 * x1)
+    return x0 - _SUM * x2 + x4, e + o, e - o, g + h, g - h, x1 - _SUM * x3 + x5
+
+
+@njit(inline="always")
+def _interpolated(m0, m1, m2, m3, m4, m5):  # type: ignore[no-untyped-def]
+    """One direction of the transform of outputs: six points -> four samples."""
+    s, d, t, u = m1 + m2, m1 - m2, m3 + m4, m3 - m4
+    return m0 + s + t, _a * d + _b * u, _a2 * s + _b2 * t, _a3 * d + _b3 * u + m5
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _gather(x, y, z, summands, top, left, rows, columns, step, patch):  # type: ignore[no-untyped-def]
+    """patch (rows, columns, C): the rectified sum of one to three maps from (top, left), zeros outside.
+
+    With step 2 the even columns come first, then the odd ones.
+    """
+    height, width, channels = x.shape
+    for i in range(rows):
+        r = top + i
+        for j in range(columns):
+            place = j if step == 1 else (j % 2) * ((columns + 1) // 2) + j // 2
+            q = left + j
+            if r < 0 or r >= height or q < 0 or q >= width:
+                for c in range(channels):
+                    patch[i, place, c] = _ZERO
+            elif summands == 1:
+                for c in range(channels):
+                    value = x[r, q, c]
+                    patch[i, place, c] = value if value > _ZERO else _ZERO
+            elif summands == 2:
+                for c in range(channels):
+                    value = x[r, q, c] + y[r, q, c]
+                    patch[i, place, c] = value if value > _ZERO else _ZERO
+            else:
+                for c in range(channels):
+                    value = x[r, q, c] + y[r, q, c] + z[r, q, c]
+                    patch[i, place, c] = value if value > _ZERO else _ZERO
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _stem(planes, weights, bias, top, left, rows, columns, patch):  # type: ignore[no-untyped-def]
+    """patch (rows, columns, C): rectified convolution of planes (K, H, W) by weights (K, 3, 3, C), zeros outside."""
+    kinds, height, width = planes.shape
+    channels = len(bias)
+    for i in range(rows):
+        r = top + i
+        for j in range(columns):
+            q = left + j
+            out = patch[i, j]
+            if r < 0 or r >= height or q < 0 or q >= width:
+                for c in range(channels):
+                    out[c] = _ZERO
+                continue
+            for c in range(channels):
+                out[c] = bias[c]
+            for k in range(kinds):
+                for dy in range(max(0, 1 - r), min(3, height + 1 - r)):
+                    for dx in range(max(0, 1 - q), min(3, width + 1 - q)):
+                        value = planes[k, r + dy - 1, q + dx - 1]
+                        if value != _ZERO:  # most pixels of a sparse map are
+                            for c in range(channels):
+                                out[c] += value * weights[k, dy, dx, c]
+            for c in range(channels):
+                out[c] = out[c] if out[c] > _ZERO else _ZERO
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _transform(patch, count, half, v):  # type: ignore[no-untyped-def]
+    """patch (6, 4 count + 2, C) -> v (36, count, C); half (6, 6, C) is scratch."""
+    channels = patch.shape[2]
+    for t in range(count):
+        for j in range(6):
+            x = 4 * t + j
+            for c in range(channels):
+                r = _evaluated(
+                    patch[0, x, c], patch[1, x, c], patch[2, x, c], patch[3, x, c], patch[4, x, c], patch[5, x, c]
+                )
+                half[0, j, c], half[1, j, c], half[2, j, c] = r[0], r[1], r[2]
+                half[3, j, c], half[4, j, c], half[5, j, c] = r[3], r[4], r[5]
+        for i in range(6):
+            p = 6 * i
+            for c in range(channels):
+                r = _evaluated(half[i, 0, c], half[i, 1, c], half[i, 2, c], half[i, 3, c], half[i, 4, c], half[i, 5, c])
+                v[p, t, c], v[p + 1, t, c], v[p + 2, t, c] = r[0], r[1], r[2]
+                v[p + 3, t, c], v[p + 4, t, c], v[p + 5, t, c] = r[3], r[4], r[5]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _transform_back(m, t, bias, half, tile):  # type: ignore[no-untyped-def]
+    """m (36, tiles, C) at tile t, plus bias (C,) -> tile (4, 4, C); half (6, 6, C) is scratch."""
+    channels = m.shape[2]
+    for j in range(6):
+        for c in range(channels):
+            r = _interpolated(
+                m[j, t, c], m[6 + j, t, c], m[12 + j, t, c], m[18 + j, t, c], m[24 + j, t, c], m[30 + j, t, c]
+            )
+            half[0, j, c], half[1, j, c], half[2, j, c], half[3, j, c] = r[0], r[1], r[2], r[3]
+    for i in range(4):
+        for c in range(channels):
+            r = _interpolated(half[i, 0, c], half[i, 1, c], half[i, 2, c], half[i, 3, c], half[i, 4, c], half[i, 5, c])
+            tile[i, 0, c], tile[i, 1, c] = r[0] + bias[c], r[1] + bias[c]
+            tile[i, 2, c], tile[i, 3, c] = r[2] + bias[c], r[3] + bias[c]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _add_upsampled(coarse, row, column, size, out):  # type: ignore[no-untyped-def]
+    """out (C,) += coarse (h, w, C) at (row, column) of an image of `size`; bilinear with aligned corners."""
+    height, width, channels = coarse.shape
+    y = np.float32(row) * (np.float32(height - 1) / np.float32(max(size[0] - 1, 1)))
+    x = np.float32(column) * (np.float32(width - 1) / np.float32(max(size[1] - 1, 1)))
+    y0, x0 = int(y), int(x)
+    y1, x1 = min(y0 + 1, height - 1), min(x0 + 1, width - 1)
+    fy, fx = y - np.float32(y0), x - np.float32(x0)
+    w00, w01, w10, w11 = (_ONE - fy) * (_ONE - fx), (_ONE - fy) * fx, fy * (_ONE - fx), fy * fx
+    for c in range(channels):
+        out[c] += w00 * coarse[y0, x0, c] + w01 * coarse[y0, x1, c] + w10 * coarse[y1, x0, c] + w11 * coarse[y1, x1, c]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _finish(patch, weights, bias, row, start, count, coarse, upsampled, work, out):  # type: ignore[no-untyped-def]
+    """The block of `count` tiles from column `start` of a row of tiles, once its patch is gathered."""
+    half, v, m, tile = work
+    height, width, channels = out.shape
+    _transform(patch, count, half, v)
+    for p in range(36):
+        np.dot(v[p, :count], weights[p], m[p, :count])
+    for t in range(count):
+        _transform_back(m, t, bias, half, tile)
+        for i in range(min(4, height - 4 * row)):
+            for j in range(min(4, width - 4 * (start + t))):
+                y, x = 4 * row + i, 4 * (start + t) + j
+                if upsampled:
+                    _add_upsampled(coarse, y, x, (height, width), tile[i, j])
+                for c in range(channels):
+                    out[y, x, c] = tile[i, j, c]
+
+
+@njit(inline="always")
+def _workspace(inputs, outputs):  # type: ignore[no-untyped-def]
+    return (
+        np.empty((6, 6, max(inputs, outputs)), np.float32),
+        np.empty((36, TILES, inputs), np.float32),
+        np.empty((36, TILES, outputs), np.float32),
+        np.empty((4, 4, outputs), np.float32),
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def convolve(first, last, x, y, z, summands, weights, bias, coarse, upsampled, out):  # type: ignore[no-untyped-def]
+    """Rows of tiles first..last of out (H, W, O): relu(x + y + z) convolved, plus bias, plus a coarser map upsampled.
+
+    x, y, z    (H, W, I), of which the first `summands` count
+    weights    (36, I, O), see `winograd_weights`
+    coarse     (h, w, O), which counts when `upsampled`
+    """
+    inputs, outputs = weights.shape[1:]
+    patch = np.empty((6, 4 * TILES + 2, inputs), np.float32)
+    work = _workspace(inputs, outputs)
+    tiles = (out.shape[1] + 3) // 4
+    for row in range(first, last):
+        for start in range(0, tiles, TILES):
+            count = min(TILES, tiles - start)
+            _gather(x, y, z, summands, 4 * row - 1, 4 * start - 1, 6, 4 * count + 2, 1, patch)
+            _finish(patch, weights, bias, row, start, count, coarse, upsampled, work, out)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def convolve_stem(first, last, planes, stem, stem_bias, weights, bias, coarse, upsampled, out):  # type: ignore[no-untyped-def]
+    """`convolve` of the rectified convolution of planes (K, H, W) by stem (K, 3, 3, I) and its bias."""
+    inputs, outputs = weights.shape[1:]
+    patch = np.empty((6, 4 * TILES + 2, inputs), np.float32)
+    work = _workspace(inputs, outputs)
+    tiles = (out.shape[1] + 3) // 4
+    for row in range(first, last):
+        for start in range(0, tiles, TILES):
+            count = min(TILES, tiles - start)
+            _stem(planes, stem, stem_bias, 4 * row - 1, 4 * start - 1, 6, 4 * count + 2, patch)
+            _finish(patch, weights, bias, row, start, count, coarse, upsampled, work, out)
+
+
+def tap_weights(weight: Tensor, transposed: bool = False) -> Float:
+    """Weights (O, I, 3, 3), or (I, O, 3, 3) when transposed -> (9, I, O) for `halve` and `double`."""
+    order = (2, 3, 0, 1) if transposed else (2, 3, 1, 0)
+    taps = weight.detach().permute(order).flatten(0, 1).contiguous().numpy()
+    return np.asarray(taps)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def halve(first, last, x, weights, bias, out):  # type: ignore[no-untyped-def]
+    """Rows first..last of out (H/2, W/2, O): relu(x), (H, W, I), convolved with stride 2 and padding 1, plus bias."""
+    inputs, outputs = weights.shape[1:]
+    patch = np.empty((3, 2 * PIXELS + 1, inputs), np.float32)
+    m = np.empty((9, PIXELS, outputs), np.float32)
+    width = out.shape[1]
+    for row in range(first, last):
+        for start in range(0, width, PIXELS):
+            n = min(PIXELS, width - start)
+            _gather(x, x, x, 1, 2 * row - 1, 2 * start - 1, 3, 2 * n + 1, 2, patch)
+            for i in range(3):
+                np.dot(patch[i, :n], weights[3 * i], m[3 * i, :n])
+                np.dot(patch[i, n + 1 : 2 * n + 1], weights[3 * i + 1], m[3 * i + 1, :n])
+                np.dot(patch[i, 1 : n + 1], weights[3 * i + 2], m[3 * i + 2, :n])
+            for j in range(n):
+                for c in range(outputs):
+                    upper = m[0, j, c] + m[1, j, c] + m[2, j, c]
+                    middle = m[3, j, c] + m[4, j, c] + m[5, j, c]
+                    lower = m[6, j, c] + m[7, j, c] + m[8, j, c]
+                    out[row, start + j, c] = bias[c] + (upper + middle + lower)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def double(first, last, x, y, z, summands, weights, bias, out):  # type: ignore[no-untyped-def]
+    """Rows first..last of x (H, W, I) -> two rows each of out (2H, 2W, O): relu(x + y + z) by a transposed convolution
+    of stride 2 (padding and output padding 1), plus bias."""
+    inputs, outputs = weights.shape[1:]
+    patch = np.empty((2, PIXELS + 1, inputs), np.float32)
+    m = np.empty((9, PIXELS, outputs), np.float32)
+    width = x.shape[1]
+    for row in range(first, last):
+        for start in range(0, width, PIXELS):
+            n = min(PIXELS, width - start)
+            _gather(x, y, z, summands, row, start, 2, n + 1, 1, patch)
+            for i in range(3):
+                source = patch[1 if i == 0 else 0]
+                for k in range(3):
+                    shift = 1 if k == 0 else 0
+                    np.dot(source[shift : shift + n], weights[3 * i + k], m[3 * i + k, :n])
+            for j in range(n):
+                left = 2 * (start + j)
+                for c in range(outputs):
+                    out[2 * row, left, c] = bias[c] + m[4, j, c]
+                    out[2 * row, left + 1, c] = bias[c] + (m[3, j, c] + m[5, j, c])
+                    out[2 * row + 1, left, c] = bias[c] + (m[1, j, c] + m[7, j, c])
+                    corners = (m[0, j, c] + m[2, j, c]) + (m[6, j, c] + m[8, j, c])
+                    out[2 * row + 1, left + 1, c] = bias[c] + corners
+
+
+def head_weights(weight: Tensor) -> Float:
+    """Weights (O, I, 3, 3) of few outputs -> (I, 9 O) for `convolve_head`."""
+    flat = weight.detach().permute(1, 2, 3, 0).flatten(1).contiguous().numpy()
+    return np.asarray(flat)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def convolve_head(first, last, x, weights, bias, out):  # type: ignore[no-untyped-def]
+    """Rows first..last of planes out (O, H, W): relu(x), (H, W, I), convolved to few channels, plus bias.
+
+    All nine taps of a row are one product; the rows above and below are kept.
+    """
+    height, width, inputs = x.shape
+    kinds = out.shape[0]
+    patch = np.empty((1, PIXELS, inputs), np.float32)
+    m = np.empty((PIXELS, weights.shape[1]), np.float32)
+    rows = np.zeros((3, width + 2, weights.shape[1]), np.float32)
+    for row in range(first - 1, last + 1):
+        kept = rows[(row + 3) % 3]
+        if row < 0 or row >= height:
+            kept[:] = _ZERO
+        else:
+            for start in range(0, width, PIXELS):
+                n = min(PIXELS, width - start)
+                _gather(x, x, x, 1, row, start, 1, n, 1, patch)
+                np.dot(patch[0, :n], weights, m[:n])
+                kept[1 + start : 1 + start + n] = m[:n]
+        if row <= first:
+            continue
+        for k in range(kinds):
+            for column in range(width):
+                total = bias[k]
+                for i in range(3):
+                    taps = rows[(row - 2 + i + 3) % 3]
+                    for j in range(3):
+                        total += taps[column + j, (3 * i + j) * kinds + k]
+                out[k, row - 1, column] = total
