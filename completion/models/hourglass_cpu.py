@@ -8,10 +8,8 @@ the maps are kept for the next frame, since a fresh one costs as much as filling
 from __future__ import annotations
 
 import copy
-import itertools
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -22,42 +20,17 @@ from torch import Tensor, nn
 from completion.models import winograd
 from completion.models.blocks import DepthDecoder, DepthEncoder, RgbEncoder
 from completion.models.hourglass import Hourglasses
+from completion.models.shared_rows import SharedRows
+from completion.models.winograd import COARSER, NOTHING, RECTIFIED
 
 Float = NDArray[np.float32]
 Features = tuple[Float, ...]
 
 
-class _Kernels:
-    """Kernels on shared rows, and maps by name, kept for the next frame of the same size."""
-
-    def __init__(self, threads: int) -> None:
-        self.threads = threads
-        self.pool = ThreadPoolExecutor(threads) if threads > 1 else None
-        self.kept: dict[str, Float] = {}
-
-    def map(self, name: str, *shape: int) -> Float:
-        """An array that is this name's until it is asked for again; its values are arbitrary."""
-        found = self.kept.get(name)
-        if found is None or found.shape != shape:
-            found = self.kept[name] = np.empty(shape, np.float32)
-        return found
-
-    def run(self, kernel: Callable[..., None], rows: int, *arguments: object) -> None:
-        """kernel(first, last, ...) over all rows, shared among the threads."""
-        if self.pool is None:
-            kernel(0, rows, *arguments)
-            return
-        # More parts than threads: one that is held up by another process takes fewer.
-        parts = min(rows, 4 * self.threads)
-        edges = [rows * part // parts for part in range(parts + 1)]
-        for done in [self.pool.submit(kernel, a, b, *arguments) for a, b in itertools.pairwise(edges)]:
-            done.result()
-
-
 class _Pair:
     """Two convolutions in a row, which is what every step of the networks consists of (see `blocks`)."""
 
-    def __init__(self, block: nn.Sequential, kernels: _Kernels, name: str) -> None:
+    def __init__(self, block: nn.Sequential, kernels: SharedRows, name: str) -> None:
         first, second = (layer for layer in block if not isinstance(layer, nn.ReLU))
         self.kernels, self.name, self.channels = kernels, name, int(first.out_channels)  # type: ignore[arg-type]
         self.first, self.first_bias = _prepared(first), _bias(first)
@@ -66,7 +39,7 @@ class _Pair:
     def stem(self, planes: Float, coarse: Float | None) -> Float:
         """Planes (K, H, W) -> (H, W, C), plus a coarser map upsampled."""
         out = self.kernels.map(self.name, *planes.shape[1:], self.channels)
-        above = (out[:1, :1], False) if coarse is None else (coarse, True)
+        above = (out, NOTHING) if coarse is None else (coarse, COARSER)
         weights = self.first, self.first_bias, self.second, self.second_bias
         self.kernels.run(winograd.convolve_stem, -(-len(out) // 4), planes, *weights, *above, out)
         return out
@@ -88,18 +61,18 @@ class _Pair:
         """Maps (H, W, C) to be added -> planes (K, H, W)."""
         height, width, _ = summands[0].shape
         hidden = self._hidden(height, width)
-        bias = np.zeros(self.channels, np.float32), self.first_bias
+        weights = self.first, self.first_bias
         rows = -(-height // 4)
-        self.kernels.run(winograd.convolve, rows, *_three(summands), self.first, bias[1], hidden[:1, :1], False, hidden)
+        self.kernels.run(winograd.convolve, rows, *_three(summands), RECTIFIED, *weights, hidden, NOTHING, hidden)
         out = np.empty((len(self.second_bias), height, width), np.float32)
         self.kernels.run(winograd.convolve_head, height, hidden, self.second, self.second_bias, out)
         return out
 
     def _second(self, summands: Features, name: str, coarse: Float | None = None) -> Float:
         out = self.kernels.map(name, *summands[0].shape[:2], self.channels)
-        above = (out[:1, :1], False) if coarse is None else (coarse, True)
+        above = (out, NOTHING) if coarse is None else (coarse, COARSER)
         weights = self.second, self.second_bias
-        self.kernels.run(winograd.convolve, -(-len(out) // 4), *_three(summands), *weights, *above, out)
+        self.kernels.run(winograd.convolve, -(-len(out) // 4), *_three(summands), RECTIFIED, *weights, *above, out)
         return out
 
     def _hidden(self, height: int, width: int) -> Float:
@@ -140,7 +113,7 @@ def _planes(x: Tensor) -> Float:
 
 
 class _RgbEncoder(nn.Module):
-    def __init__(self, block: RgbEncoder, kernels: _Kernels) -> None:
+    def __init__(self, block: RgbEncoder, kernels: SharedRows) -> None:
         super().__init__()
         self.steps = [_Pair(step, kernels, f"colour {name}") for name, step in block.named_children()]  # type: ignore[arg-type]
 
@@ -152,7 +125,7 @@ class _RgbEncoder(nn.Module):
 
 
 class _DepthEncoder(nn.Module):
-    def __init__(self, block: DepthEncoder, kernels: _Kernels, stage: int) -> None:
+    def __init__(self, block: DepthEncoder, kernels: SharedRows, stage: int) -> None:
         super().__init__()
         self.steps = [_Pair(step, kernels, f"{stage} {name}") for name, step in block.named_children()]  # type: ignore[arg-type]
 
@@ -165,7 +138,7 @@ class _DepthEncoder(nn.Module):
 
 
 class _DepthDecoder(nn.Module):
-    def __init__(self, block: DepthDecoder, kernels: _Kernels, stage: int, extra_skips: bool) -> None:
+    def __init__(self, block: DepthDecoder, kernels: SharedRows, stage: int, extra_skips: bool) -> None:
         super().__init__()
         steps = (block.dec2, block.dec1, block.prdct)
         self.dec2, self.dec1, self.predict = (
@@ -187,7 +160,7 @@ def convolutions(model: Hourglasses) -> Callable[[Tensor, Tensor], Tensor]:
     The weights are those at the time of this call. About 1 KB per pixel and 64 channels is held between frames
     (600 MB for 352x1216).
     """
-    kernels = _Kernels(torch.get_num_threads())
+    kernels = SharedRows(torch.get_num_threads())
     fast = copy.copy(model)
     fast._modules = {}
     fast.rgb_encoder = _RgbEncoder(model.rgb_encoder, kernels)  # type: ignore[assignment]

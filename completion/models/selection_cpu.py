@@ -20,6 +20,7 @@ from torch import Tensor
 
 from completion.inputs import scale_rgb
 from completion.mixture import surface_shares
+from completion.models.pixel_unet_cpu import PixelUNetKernels
 from completion.models.rings import interpolate_rows, sweep
 from completion.models.selection import CANDIDATES, CHANNELS, COLUMN_SHIFTS, INPUTS, Selection
 from completion.twin_surface import fuse
@@ -161,6 +162,41 @@ def _quantile(depths, cumulated, share, out):  # type: ignore[no-untyped-def]
             out[i] = reached if reached < out[i] else out[i]
 
 
+@njit(inline="always")
+def _distribution(weights, depths, cumulated, found, logs, y, start, shifts, residual, shares):  # type: ignore[no-untyped-def]
+    """Logits and corrections of a run of pixels -> weights, log depths, and found (4, n): log depth of foreground,
+    median and background, weight of the foreground."""
+    _candidates(logs, y, start, shifts, residual, depths)
+    _softmax(weights, found[0])
+    _cumulate(weights, depths, cumulated)
+    for s in range(3):
+        _quantile(depths, cumulated, shares[s], found[s])
+    found[3] = _ZERO
+    for k in range(CANDIDATES):
+        for i in range(_RUN):
+            nearer = depths[k, i] <= _HALF * (found[0, i] + found[2, i])
+            found[3, i] += weights[k, i] if nearer else _ZERO
+
+
+@njit(inline="always")
+def _write_run(weights, depths, cumulated, found, expected, y, start, out):  # type: ignore[no-untyped-def]
+    """Metres of a run of pixels from what `_distribution` found; see `_read_rows`."""
+    if expected:
+        cumulated[0] = _ZERO
+        for k in range(CANDIDATES):
+            for i in range(_RUN):
+                cumulated[0, i] += weights[k, i] * _exp(depths[k, i])
+    for i in range(_RUN):
+        cumulated[1, i] = _exp(found[1, i])
+        found[0, i] = _exp(found[0, i])
+        found[2, i] = _exp(found[2, i])
+    for i in range(min(_RUN, out.shape[2] - start)):
+        out[0, y, start + i] = cumulated[0, i] if expected else cumulated[1, i]
+        out[1, y, start + i] = found[0, i]
+        out[2, y, start + i] = found[2, i]
+        out[3, y, start + i] = found[3, i] if found[3, i] < _ONE else _ONE
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _read_rows(first, last, head, logs, top, shifts, residual, shares, expected, out):  # type: ignore[no-untyped-def]
     """Rows first..last of out (4, h, w): depth, foreground, background, sigma.
@@ -168,39 +204,41 @@ def _read_rows(first, last, head, logs, top, shifts, residual, shares, expected,
     head (H/2, W/2, 84), logs (3, H, W); the image begins at row `top`; shares of foreground, median, background;
     depth is the mean when `expected`, else the median.
     """
-    weights = np.zeros((CANDIDATES, _RUN), np.float32)
-    depths = np.zeros((CANDIDATES, _RUN), np.float32)
-    cumulated = np.empty((CANDIDATES, _RUN), np.float32)
-    found = np.empty((4, _RUN), np.float32)
-    width = out.shape[2]
+    weights, depths = np.zeros((CANDIDATES, _RUN), np.float32), np.zeros((CANDIDATES, _RUN), np.float32)
+    cumulated, found = np.empty((CANDIDATES, _RUN), np.float32), np.empty((4, _RUN), np.float32)
     for y in range(first, last):
-        for start in range(0, width, _RUN):
-            count = min(_RUN, width - start)
+        for start in range(0, out.shape[2], _RUN):
             _gather(head, y + top, start, min(_RUN, logs.shape[2] - start), weights, depths)
-            _candidates(logs, y + top, start, shifts, residual, depths)
-            _softmax(weights, found[0])
-            _cumulate(weights, depths, cumulated)
-            for s in range(3):
-                _quantile(depths, cumulated, shares[s], found[s])
-            found[3] = _ZERO
-            for k in range(CANDIDATES):
-                for i in range(_RUN):
-                    nearer = depths[k, i] <= _HALF * (found[0, i] + found[2, i])
-                    found[3, i] += weights[k, i] if nearer else _ZERO
-            if expected:
-                cumulated[0] = _ZERO
-                for k in range(CANDIDATES):
-                    for i in range(_RUN):
-                        cumulated[0, i] += weights[k, i] * _exp(depths[k, i])
-            for i in range(_RUN):
-                cumulated[1, i] = _exp(found[1, i])
-                found[0, i] = _exp(found[0, i])
-                found[2, i] = _exp(found[2, i])
+            _distribution(weights, depths, cumulated, found, logs, y + top, start, shifts, residual, shares)
+            _write_run(weights, depths, cumulated, found, expected, y, start, out)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _read_features(first, last, features, kernels, bias, logs, top, shifts, residual, shares, expected, out):  # type: ignore[no-untyped-def]
+    """`_read_rows` from what the head convolves: features (H/2, W/2, C), see `PixelUNetKernels`.
+
+    The head is by far the largest map; here no more of it exists than a run of pixels takes.
+    """
+    weights, depths = np.zeros((CANDIDATES, _RUN), np.float32), np.zeros((CANDIDATES, _RUN), np.float32)
+    cumulated, found = np.empty((CANDIDATES, _RUN), np.float32), np.empty((4, _RUN), np.float32)
+    rectified = np.empty((_RUN // 2, features.shape[2]), np.float32)
+    head = np.empty((_RUN // 2, 4 * CANDIDATES), np.float32)
+    for y in range(first, last):
+        source, side = (y + top) // 2, (y + top) % 2
+        for start in range(0, out.shape[2], _RUN):
+            count = min(_RUN, logs.shape[2] - start) // 2
             for i in range(count):
-                out[0, y, start + i] = cumulated[0, i] if expected else cumulated[1, i]
-                out[1, y, start + i] = found[0, i]
-                out[2, y, start + i] = found[2, i]
-                out[3, y, start + i] = found[3, i] if found[3, i] < _ONE else _ONE
+                for c in range(features.shape[2]):
+                    rectified[i, c] = max(features[source, start // 2 + i, c], _ZERO)
+            np.dot(rectified[:count], kernels[side], head[:count])
+            for k in range(CANDIDATES):
+                for c in range(2):
+                    a, b = 2 * k + c, 2 * (CANDIDATES + k) + c
+                    for i in range(count):
+                        weights[k, 2 * i + c] = head[i, a] + bias[side, a]
+                        depths[k, 2 * i + c] = head[i, b] + bias[side, b]
+            _distribution(weights, depths, cumulated, found, logs, y + top, start, shifts, residual, shares)
+            _write_run(weights, depths, cumulated, found, expected, y, start, out)
 
 
 def _in_threads(kernel: Callable[..., None], rows: int, *arguments: object) -> None:
@@ -244,7 +282,8 @@ def complete_mixture(
 ) -> tuple[Float, Float, Float, Float]:
     """Sparse (h, w) metres and image (h, w, 3) of any size -> depth, foreground, background, sigma, each (h, w).
 
-    convolutions  (1, 40, H/2, W/2) -> (1, 84, H/2, W/2), an export of `model.network.at_half`; None: that itself
+    convolutions  (1, 40, H/2, W/2) -> (1, 84, H/2, W/2), an export of `model.network.at_half` or our kernels; None:
+                  that itself
     scaling       of the colours, see `inputs.scale_rgb`
     read_out      one of `readout.MIXTURE_READ_OUTS`
     """
@@ -256,28 +295,22 @@ def complete_mixture(
     levels = torch.arange(256, dtype=torch.float32).expand(1, 3, 1, 256)
     colours = scale_rgb(levels, scaling)[0, :, 0].contiguous().numpy()
     half = (padded.shape[0] // 2, padded.shape[1] // 2)
-    if convolutions is None:  # torch is fastest with the channels of a pixel together, exports take planes
-        features = np.empty((*half, 4 * INPUTS), np.float32)
+    if convolutions is None or isinstance(convolutions, PixelUNetKernels):
+        features = np.empty((*half, 4 * INPUTS), np.float32)  # the channels of a pixel together; exports take planes
     else:
         features = np.empty((4 * INPUTS, *half), np.float32).transpose(1, 2, 0)
     _in_threads(_write_inputs, half[0], pixels, colours, padded, rings, logs, features)
-    run = convolutions or model.network.at_half
-    head = run(torch.from_numpy(features).permute(2, 0, 1)[None])
-    assert head.shape[1] == 4 * CHANNELS, head.shape
     low, high = surface_shares(GAMMA)
+    shares = np.array((low, 0.5, high), np.float32)
     out = np.empty((4, height, width), np.float32)
-    _in_threads(
-        _read_rows,
-        height,
-        head[0].float().permute(1, 2, 0).numpy(),
-        logs,
-        top,
-        np.array(COLUMN_SHIFTS),
-        np.float32(model.residual),
-        np.array((low, 0.5, high), np.float32),
-        read_out == "expected",
-        out,
-    )
+    common = logs, top, np.array(COLUMN_SHIFTS), np.float32(model.residual), shares, read_out == "expected", out
+    if isinstance(convolutions, PixelUNetKernels):
+        _in_threads(_read_features, height, convolutions.before_head(features), *convolutions.head, *common)
+    else:
+        run = convolutions or model.network.at_half
+        head = run(torch.from_numpy(features).permute(2, 0, 1)[None])
+        assert head.shape[1] == 4 * CHANNELS, head.shape
+        _in_threads(_read_rows, height, head[0].float().permute(1, 2, 0).numpy(), *common)
     depth, foreground, background, sigma = out
     if read_out not in ("median", "expected"):
         depth = fuse(foreground, background, sigma, read_out)

@@ -25,10 +25,13 @@ _A, _B = math.sqrt(0.5), math.sqrt(2)
 _POINTS = (0.0, _A, -_A, _B, -_B)
 _a, _b, _a2, _b2, _a3, _b3 = (np.float32(value) for value in (_A, _B, _A**2, _B**2, _A**3, _B**3))
 _SUM = np.float32(2.5)  # a^2 + b^2; a^2 b^2 is 1
-_ZERO, _ONE, _LOWEST = np.float32(0), np.float32(1), np.float32(-np.inf)
-# Tiles and pixels of a block: everything a block touches stays in the second-level cache, and products of this size
-# (64 channels) are below those for which BLAS libraries start threads of their own.
-TILES = 16
+_ZERO, _ONE = np.float32(0), np.float32(1)
+# Lower bounds of the inputs of a convolution.
+RECTIFIED, LINEAR = np.float32(0), np.float32(-np.inf)
+# What a convolution adds to its result: nothing, a map of its size, a coarser one (bilinear with aligned corners).
+NOTHING, SAME, COARSER = 0, 1, 2
+# Pixels of a block of `halve`, `double` and `convolve_head`. These and the tiles of `_tiles` keep a block in the
+# second-level cache, and its products below the size for which BLAS libraries start threads of their own.
 PIXELS = 32
 
 
@@ -60,8 +63,8 @@ def _interpolated(m0, m1, m2, m3, m4, m5):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _gather(x, y, z, summands, top, left, rows, columns, step, patch):  # type: ignore[no-untyped-def]
-    """patch (rows, columns, C): the rectified sum of one to three maps from (top, left), zeros outside.
+def _gather(x, y, z, summands, least, top, left, rows, columns, step, patch):  # type: ignore[no-untyped-def]
+    """patch (rows, columns, C): the sum of one to three maps from (top, left), cut at `least`, zeros outside.
 
     With step 2 the even columns come first, then the odd ones.
     """
@@ -77,15 +80,15 @@ def _gather(x, y, z, summands, top, left, rows, columns, step, patch):  # type: 
             elif summands == 1:
                 for c in range(channels):
                     value = x[r, q, c]
-                    patch[i, place, c] = value if value > _ZERO else _ZERO
+                    patch[i, place, c] = value if value > least else least
             elif summands == 2:
                 for c in range(channels):
                     value = x[r, q, c] + y[r, q, c]
-                    patch[i, place, c] = value if value > _ZERO else _ZERO
+                    patch[i, place, c] = value if value > least else least
             else:
                 for c in range(channels):
                     value = x[r, q, c] + y[r, q, c] + z[r, q, c]
-                    patch[i, place, c] = value if value > _ZERO else _ZERO
+                    patch[i, place, c] = value if value > least else least
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
@@ -168,7 +171,7 @@ def _add_upsampled(coarse, row, column, size, out):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _finish(patch, weights, bias, row, start, count, coarse, upsampled, work, out):  # type: ignore[no-untyped-def]
+def _finish(patch, weights, bias, row, start, count, other, kind, work, out):  # type: ignore[no-untyped-def]
     """The block of `count` tiles from column `start` of a row of tiles, once its patch is gathered."""
     half, v, m, tile = work
     height, width, channels = out.shape
@@ -180,53 +183,64 @@ def _finish(patch, weights, bias, row, start, count, coarse, upsampled, work, ou
         for i in range(min(4, height - 4 * row)):
             for j in range(min(4, width - 4 * (start + t))):
                 y, x = 4 * row + i, 4 * (start + t) + j
-                if upsampled:
-                    _add_upsampled(coarse, y, x, (height, width), tile[i, j])
-                for c in range(channels):
-                    out[y, x, c] = tile[i, j, c]
+                if kind == COARSER:
+                    _add_upsampled(other, y, x, (height, width), tile[i, j])
+                if kind == SAME:
+                    for c in range(channels):
+                        out[y, x, c] = tile[i, j, c] + other[y, x, c]
+                else:
+                    for c in range(channels):
+                        out[y, x, c] = tile[i, j, c]
 
 
 @njit(inline="always")
-def _workspace(inputs, outputs):  # type: ignore[no-untyped-def]
+def _tiles(channels):  # type: ignore[no-untyped-def]
+    """Tiles of a block: 16 for 64 channels."""
+    return max(8, 1024 // channels)
+
+
+@njit(inline="always")
+def _workspace(tiles, inputs, outputs):  # type: ignore[no-untyped-def]
     return (
         np.empty((6, 6, max(inputs, outputs)), np.float32),
-        np.empty((36, TILES, inputs), np.float32),
-        np.empty((36, TILES, outputs), np.float32),
+        np.empty((36, tiles, inputs), np.float32),
+        np.empty((36, tiles, outputs), np.float32),
         np.empty((4, 4, outputs), np.float32),
     )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def convolve(first, last, x, y, z, summands, weights, bias, coarse, upsampled, out):  # type: ignore[no-untyped-def]
-    """Rows of tiles first..last of out (H, W, O): relu(x + y + z) convolved, plus bias, plus a coarser map upsampled.
+def convolve(first, last, x, y, z, summands, least, weights, bias, other, kind, out):  # type: ignore[no-untyped-def]
+    """Rows of tiles first..last of out (H, W, O): x + y + z, cut at `least`, convolved, plus bias, plus another map.
 
     x, y, z    (H, W, I), of which the first `summands` count
     weights    (36, I, O), see `winograd_weights`
-    coarse     (h, w, O), which counts when `upsampled`
+    least      RECTIFIED or LINEAR
+    other      (H, W, O) or (h, w, O), as `kind` says: NOTHING, SAME or COARSER
     """
     inputs, outputs = weights.shape[1:]
-    patch = np.empty((6, 4 * TILES + 2, inputs), np.float32)
-    work = _workspace(inputs, outputs)
-    tiles = (out.shape[1] + 3) // 4
+    tiles, across = _tiles(max(inputs, outputs)), (out.shape[1] + 3) // 4
+    patch = np.empty((6, 4 * tiles + 2, inputs), np.float32)
+    work = _workspace(tiles, inputs, outputs)
     for row in range(first, last):
-        for start in range(0, tiles, TILES):
-            count = min(TILES, tiles - start)
-            _gather(x, y, z, summands, 4 * row - 1, 4 * start - 1, 6, 4 * count + 2, 1, patch)
-            _finish(patch, weights, bias, row, start, count, coarse, upsampled, work, out)
+        for start in range(0, across, tiles):
+            count = min(tiles, across - start)
+            _gather(x, y, z, summands, least, 4 * row - 1, 4 * start - 1, 6, 4 * count + 2, 1, patch)
+            _finish(patch, weights, bias, row, start, count, other, kind, work, out)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def convolve_stem(first, last, planes, stem, stem_bias, weights, bias, coarse, upsampled, out):  # type: ignore[no-untyped-def]
+def convolve_stem(first, last, planes, stem, stem_bias, weights, bias, other, kind, out):  # type: ignore[no-untyped-def]
     """`convolve` of the rectified convolution of planes (K, H, W) by stem (K, 3, 3, I) and its bias."""
     inputs, outputs = weights.shape[1:]
-    patch = np.empty((6, 4 * TILES + 2, inputs), np.float32)
-    work = _workspace(inputs, outputs)
-    tiles = (out.shape[1] + 3) // 4
+    tiles, across = _tiles(max(inputs, outputs)), (out.shape[1] + 3) // 4
+    patch = np.empty((6, 4 * tiles + 2, inputs), np.float32)
+    work = _workspace(tiles, inputs, outputs)
     for row in range(first, last):
-        for start in range(0, tiles, TILES):
-            count = min(TILES, tiles - start)
+        for start in range(0, across, tiles):
+            count = min(tiles, across - start)
             _stem(planes, stem, stem_bias, 4 * row - 1, 4 * start - 1, 6, 4 * count + 2, patch)
-            _finish(patch, weights, bias, row, start, count, coarse, upsampled, work, out)
+            _finish(patch, weights, bias, row, start, count, other, kind, work, out)
 
 
 def tap_weights(weight: Tensor, transposed: bool = False) -> Float:
@@ -246,7 +260,7 @@ def halve(first, last, x, weights, bias, out):  # type: ignore[no-untyped-def]
     for row in range(first, last):
         for start in range(0, width, PIXELS):
             n = min(PIXELS, width - start)
-            _gather(x, x, x, 1, 2 * row - 1, 2 * start - 1, 3, 2 * n + 1, 2, patch)
+            _gather(x, x, x, 1, RECTIFIED, 2 * row - 1, 2 * start - 1, 3, 2 * n + 1, 2, patch)
             for i in range(3):
                 np.dot(patch[i, :n], weights[3 * i], m[3 * i, :n])
                 np.dot(patch[i, n + 1 : 2 * n + 1], weights[3 * i + 1], m[3 * i + 1, :n])
@@ -270,7 +284,7 @@ def double(first, last, x, y, z, summands, weights, bias, out):  # type: ignore[
     for row in range(first, last):
         for start in range(0, width, PIXELS):
             n = min(PIXELS, width - start)
-            _gather(x, y, z, summands, row, start, 2, n + 1, 1, patch)
+            _gather(x, y, z, summands, RECTIFIED, row, start, 2, n + 1, 1, patch)
             for i in range(3):
                 source = patch[1 if i == 0 else 0]
                 for k in range(3):
@@ -284,6 +298,44 @@ def double(first, last, x, y, z, summands, weights, bias, out):  # type: ignore[
                     out[2 * row + 1, left, c] = bias[c] + (m[1, j, c] + m[7, j, c])
                     corners = (m[0, j, c] + m[2, j, c]) + (m[6, j, c] + m[8, j, c])
                     out[2 * row + 1, left + 1, c] = bias[c] + corners
+
+
+def quarter_weights(weight: Tensor) -> Float:
+    """Weights (O, I, 2, 2) -> (2, 2 I, O) for `quarter`."""
+    return np.asarray(weight.detach().permute(2, 3, 1, 0).flatten(1, 2).contiguous().numpy())
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def quarter(first, last, pairs, weights, bias, out):  # type: ignore[no-untyped-def]
+    """Rows first..last of out (H/2, W/2, O): x convolved by 2x2 with stride 2, plus bias.
+
+    pairs  (H/2, 2, W/2, 2 I), a view of x (H, W, I): the two pixels of a row that belong together lie together
+    """
+    m = np.empty((2, PIXELS, len(bias)), np.float32)
+    for row in range(first, last):
+        for start in range(0, out.shape[1], PIXELS):
+            n = min(PIXELS, out.shape[1] - start)
+            for i in range(2):
+                np.dot(pairs[row, i, start : start + n], weights[i], m[i, :n])
+            for j in range(n):
+                for c in range(len(bias)):
+                    out[row, start + j, c] = bias[c] + (m[0, j, c] + m[1, j, c])
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def lift(first, last, x, weights, bias, skip, out):  # type: ignore[no-untyped-def]
+    """Rows first..last of x (h, w, I) -> two rows each of out (2h, 2w, O): weights (I, O), bias, each pixel repeated
+    2x2, plus skip."""
+    m = np.empty((PIXELS, len(bias)), np.float32)
+    for row in range(first, last):
+        for start in range(0, x.shape[1], PIXELS):
+            n = min(PIXELS, x.shape[1] - start)
+            np.dot(x[row, start : start + n], weights, m[:n])
+            for y in range(2 * row, 2 * row + 2):
+                for j in range(2 * n):
+                    column = 2 * start + j
+                    for c in range(len(bias)):
+                        out[y, column, c] = skip[y, column, c] + (m[j // 2, c] + bias[c])
 
 
 def head_weights(weight: Tensor) -> Float:
@@ -310,7 +362,7 @@ def convolve_head(first, last, x, weights, bias, out):  # type: ignore[no-untype
         else:
             for start in range(0, width, PIXELS):
                 n = min(PIXELS, width - start)
-                _gather(x, x, x, 1, row, start, 1, n, 1, patch)
+                _gather(x, x, x, 1, RECTIFIED, row, start, 1, n, 1, patch)
                 np.dot(patch[0, :n], weights, m[:n])
                 kept[1 + start : 1 + start + n] = m[:n]
         if row <= first:

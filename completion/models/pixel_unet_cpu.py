@@ -1,0 +1,108 @@
+"""`selection.PixelUNet` for inference on the CPU, by the kernels of `winograd`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from completion.models import winograd
+from completion.models.selection import CANDIDATES, PixelUNet, Residual
+from completion.models.shared_rows import SharedRows
+from completion.models.winograd import LINEAR, NOTHING, RECTIFIED, SAME
+
+Float = NDArray[np.float32]
+
+
+class PixelUNetKernels:
+    """The convolutions of a U-Net with its weights at the time of this call, and as many threads as torch has then.
+
+    head         (2, C, 40) and (40,) of bias: what `selection_cpu` reads of the last layer, for even and odd rows
+    """
+
+    def __init__(self, network: PixelUNet) -> None:
+        self.network = network
+        self.rows = SharedRows(torch.get_num_threads())
+        self.stem = _winograd(network.stem)
+        self.encoder: list[list[Any]] = [[_residual(one) for one in stage] for stage in network.encoder]  # type: ignore[union-attr]
+        self.down = [(winograd.quarter_weights(one.weight), _bias(one)) for one in network.down]  # type: ignore[arg-type]
+        self.up = [(_array(one.weight[:, :, 0, 0].T), _bias(one)) for one in network.up]  # type: ignore[index]
+        self.decoder = [_residual(one) for one in network.decoder]
+        self.head = _head(network.head.weight[:, :, 0, 0]), _head(network.head.bias)
+
+    def __call__(self, features: Tensor) -> Tensor:
+        """(1, 4 inputs, H/2, W/2) -> (1, 4 outputs, H/2, W/2), like `PixelUNet.at_half`."""
+        hidden = self.before_head(_array(features[0].permute(1, 2, 0)))
+        with torch.inference_mode():
+            head: Tensor = self.network.head(F.relu(torch.from_numpy(hidden).permute(2, 0, 1)[None]))
+        return head
+
+    def before_head(self, features: Float) -> Float:
+        """(H/2, W/2, 4 inputs) -> (H/2, W/2, C), what the head rectifies; overwritten by the next call."""
+        x = self._convolve("stem", features, LINEAR, self.stem)
+        skips = []
+        for level, (stage, down) in enumerate(zip(self.encoder, self.down)):
+            x = self._residuals(f"encoder {level}", x, stage)
+            skips.append(x)
+            x = self._quarter(f"down {level}", x, down)
+        x = self._residuals("bottom", x, self.encoder[-1])
+        for level in reversed(range(len(skips))):
+            x = self._lift(f"up {level}", x, self.up[level], skips[level])
+            x = self._residuals(f"decoder {level}", x, [self.decoder[level]])
+        return x
+
+    def _residuals(self, name: str, x: Float, layers: list[Any]) -> Float:
+        for number, (first, second) in enumerate(layers):
+            hidden = self._convolve(f"{name} hidden", x, RECTIFIED, first)
+            x = self._convolve(f"{name} {number}", hidden, RECTIFIED, second, x)
+        return x
+
+    def _convolve(self, name: str, x: Float, least: object, layer: Any, added: Float | None = None) -> Float:
+        weights, bias = layer
+        out = self.rows.map(name, *x.shape[:2], len(bias))
+        other = (out, NOTHING) if added is None else (added, SAME)
+        self.rows.run(winograd.convolve, -(-len(out) // 4), x, x, x, 1, least, weights, bias, *other, out)
+        return out
+
+    def _quarter(self, name: str, x: Float, layer: Any) -> Float:
+        height, width, channels = x.shape
+        out = self.rows.map(name, height // 2, width // 2, len(layer[1]))
+        pairs = x.reshape(height // 2, 2, width // 2, 2 * channels)
+        self.rows.run(winograd.quarter, len(out), pairs, *layer, out)
+        return out
+
+    def _lift(self, name: str, x: Float, layer: Any, skip: Float) -> Float:
+        out = self.rows.map(name, *skip.shape)
+        self.rows.run(winograd.lift, len(x), x, *layer, skip, out)
+        return out
+
+
+def _array(x: Tensor) -> Float:
+    return np.asarray(x.detach().contiguous().numpy())
+
+
+def _bias(layer: Any) -> Float:
+    return _array(layer.bias)
+
+
+def _winograd(layer: nn.Conv2d) -> tuple[Float, Float]:
+    return winograd.winograd_weights(layer.weight), _bias(layer)
+
+
+def _residual(block: nn.Module) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
+    assert isinstance(block, Residual)
+    return _winograd(block.conv1), _winograd(block.conv2)
+
+
+def _head(parameters: Tensor) -> Float:
+    """Rows (4 outputs, ...) of the last layer -> (2, ..., 40): row of the image; output and column of the image.
+
+    Undoes the pixel shuffle, and leaves out the scale, which no read-out needs.
+    """
+    shuffled = parameters.detach().unflatten(0, (-1, 2, 2))[: 2 * CANDIDATES]
+    rest = tuple(range(3, shuffled.ndim))
+    return _array(shuffled.permute(1, *rest, 0, 2).flatten(-2))
