@@ -119,41 +119,46 @@ def _stem(planes, weights, bias, top, left, rows, columns, patch):  # type: igno
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _transform(patch, count, half, v):  # type: ignore[no-untyped-def]
-    """patch (6, 4 count + 2, C) -> v (36, count, C); half (6, 6, C) is scratch."""
+def _transform(patch, count, v):  # type: ignore[no-untyped-def]
+    """patch (6, 4 count + 2, C), overwritten -> v (36, count, C)."""
     channels = patch.shape[2]
-    for t in range(count):
-        for j in range(6):
-            x = 4 * t + j
+    flat = patch.reshape(6, -1)  # columns first, in one long loop: tiles share them
+    for i in range((4 * count + 2) * channels):
+        r = _evaluated(flat[0, i], flat[1, i], flat[2, i], flat[3, i], flat[4, i], flat[5, i])
+        flat[0, i], flat[1, i], flat[2, i], flat[3, i], flat[4, i], flat[5, i] = r
+    for i in range(6):
+        p = 6 * i
+        for t in range(count):
+            x = patch[i, 4 * t : 4 * t + 6]
             for c in range(channels):
-                r = _evaluated(
-                    patch[0, x, c], patch[1, x, c], patch[2, x, c], patch[3, x, c], patch[4, x, c], patch[5, x, c]
-                )
-                half[0, j, c], half[1, j, c], half[2, j, c] = r[0], r[1], r[2]
-                half[3, j, c], half[4, j, c], half[5, j, c] = r[3], r[4], r[5]
-        for i in range(6):
-            p = 6 * i
-            for c in range(channels):
-                r = _evaluated(half[i, 0, c], half[i, 1, c], half[i, 2, c], half[i, 3, c], half[i, 4, c], half[i, 5, c])
+                r = _evaluated(x[0, c], x[1, c], x[2, c], x[3, c], x[4, c], x[5, c])
                 v[p, t, c], v[p + 1, t, c], v[p + 2, t, c] = r[0], r[1], r[2]
                 v[p + 3, t, c], v[p + 4, t, c], v[p + 5, t, c] = r[3], r[4], r[5]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _transform_back(m, t, bias, half, tile):  # type: ignore[no-untyped-def]
-    """m (36, tiles, C) at tile t, plus bias (C,) -> tile (4, 4, C); half (6, 6, C) is scratch."""
-    channels = m.shape[2]
+def _transform_columns_back(m, count):  # type: ignore[no-untyped-def]
+    """m (36, count, C): the first half of the transform of outputs, in place; its first 24 maps are left."""
+    flat = m.reshape(36, -1)
     for j in range(6):
-        for c in range(channels):
+        for i in range(count * m.shape[2]):
             r = _interpolated(
-                m[j, t, c], m[6 + j, t, c], m[12 + j, t, c], m[18 + j, t, c], m[24 + j, t, c], m[30 + j, t, c]
+                flat[j, i], flat[6 + j, i], flat[12 + j, i], flat[18 + j, i], flat[24 + j, i], flat[30 + j, i]
             )
-            half[0, j, c], half[1, j, c], half[2, j, c], half[3, j, c] = r[0], r[1], r[2], r[3]
-    for i in range(4):
-        for c in range(channels):
-            r = _interpolated(half[i, 0, c], half[i, 1, c], half[i, 2, c], half[i, 3, c], half[i, 4, c], half[i, 5, c])
-            tile[i, 0, c], tile[i, 1, c] = r[0] + bias[c], r[1] + bias[c]
-            tile[i, 2, c], tile[i, 3, c] = r[2] + bias[c], r[3] + bias[c]
+            flat[j, i], flat[6 + j, i], flat[12 + j, i], flat[18 + j, i] = r
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _transform_row_back(m, t, bias, pixels):  # type: ignore[no-untyped-def]
+    """The other half: m (6, count, C) at tile t, plus bias (C,) -> pixels (4, C)."""
+    for c in range(len(bias)):
+        r = _interpolated(m[0, t, c], m[1, t, c], m[2, t, c], m[3, t, c], m[4, t, c], m[5, t, c])
+        pixels[0, c], pixels[1, c], pixels[2, c], pixels[3, c] = (
+            r[0] + bias[c],
+            r[1] + bias[c],
+            r[2] + bias[c],
+            r[3] + bias[c],
+        )
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
@@ -173,24 +178,27 @@ def _add_upsampled(coarse, row, column, size, out):  # type: ignore[no-untyped-d
 @njit(cache=True, nogil=True, error_model="numpy")
 def _finish(patch, weights, bias, row, start, count, other, kind, work, out):  # type: ignore[no-untyped-def]
     """The block of `count` tiles from column `start` of a row of tiles, once its patch is gathered."""
-    half, v, m, tile = work
+    v, m, border = work
     height, width, channels = out.shape
-    _transform(patch, count, half, v)
+    _transform(patch, count, v)
     for p in range(36):
         np.dot(v[p, :count], weights[p], m[p, :count])
-    for t in range(count):
-        _transform_back(m, t, bias, half, tile)
-        for i in range(min(4, height - 4 * row)):
-            for j in range(min(4, width - 4 * (start + t))):
-                y, x = 4 * row + i, 4 * (start + t) + j
+    _transform_columns_back(m, count)
+    for i in range(min(4, height - 4 * row)):
+        y = 4 * row + i
+        for t in range(count):
+            x = 4 * (start + t)
+            inside = min(4, width - x)
+            pixels = out[y, x : x + 4] if inside == 4 else border
+            _transform_row_back(m[6 * i : 6 * i + 6], t, bias, pixels)
+            for j in range(inside if kind != NOTHING else 0):
                 if kind == COARSER:
-                    _add_upsampled(other, y, x, (height, width), tile[i, j])
-                if kind == SAME:
-                    for c in range(channels):
-                        out[y, x, c] = tile[i, j, c] + other[y, x, c]
+                    _add_upsampled(other, y, x + j, (height, width), pixels[j])
                 else:
                     for c in range(channels):
-                        out[y, x, c] = tile[i, j, c]
+                        pixels[j, c] += other[y, x + j, c]
+            if inside < 4:
+                out[y, x:width] = border[:inside]
 
 
 @njit(inline="always")
@@ -202,10 +210,9 @@ def _tiles(channels):  # type: ignore[no-untyped-def]
 @njit(inline="always")
 def _workspace(tiles, inputs, outputs):  # type: ignore[no-untyped-def]
     return (
-        np.empty((6, 6, max(inputs, outputs)), np.float32),
         np.empty((36, tiles, inputs), np.float32),
         np.empty((36, tiles, outputs), np.float32),
-        np.empty((4, 4, outputs), np.float32),
+        np.empty((4, outputs), np.float32),
     )
 
 
