@@ -1,4 +1,4 @@
-"""Who computes the convolutions on the CPU: torch, or an export of the network in ONNX Runtime or OpenVINO.
+"""Who computes the convolutions on the CPU: torch, kernels of our own, or an export in ONNX Runtime or OpenVINO.
 
 Exports are kept in the user's cache folder ($XDG_CACHE_HOME/auglidar, ~/.cache/auglidar) under the SHA-256 of their
 weights; any image size fits one file. Deleting them is always safe.
@@ -17,9 +17,12 @@ import torch
 from torch import Tensor, nn
 
 from completion.checkpoints import Card, write_atomically
+from completion.models import hourglass_cpu
+from completion.models.hourglass import Hourglasses
+from completion.models.pixel_unet_cpu import PixelUNetKernels
 from completion.models.selection import INPUTS, Selection
 
-BACKENDS = ("torch", "onnxruntime", "openvino", "auto")
+BACKENDS = ("torch", "numba", "onnxruntime", "openvino", "auto")
 # Pure convolutions; the others encode depth or are too large to be worth it.
 EXPORTABLE = ("selection", "twise", "msg_chn")
 OPSET = 17
@@ -46,13 +49,13 @@ class _Part(nn.Module):
 def other_than_torch(model: nn.Module, card: Card, device: str, backend: str) -> Convolutions | None:
     """The convolutions of a network for `infer.NetworkCompleter`, or None when torch is to compute them.
 
-    backend  one of BACKENDS; "auto" is ONNX Runtime where it is installed and can run this network, else torch
+    backend  one of BACKENDS; "auto" is "numba", the fastest, for the networks it can run, else torch
 
     ValueError for a network or device that `backend` cannot run, ImportError when its packages are missing.
     """
     fits = card.model.architecture in EXPORTABLE and torch.device(device).type == "cpu"
     if backend == "auto":
-        backend = "onnxruntime" if fits and find_spec("onnx") and find_spec("onnxruntime") else "torch"
+        backend = "numba" if fits else "torch"
     if backend == "torch":
         return None
     if not fits:
@@ -60,12 +63,22 @@ def other_than_torch(model: nn.Module, card: Card, device: str, backend: str) ->
             f"backend {backend!r} runs {', '.join(EXPORTABLE)} on the CPU, not {card.model.architecture} on {device}; "
             "use backend 'torch'"
         )
+    if backend == "numba":
+        return own_kernels(model)
     for package in ("onnx", "onnxruntime") if backend == "onnxruntime" else ("onnx", "openvino"):
         if find_spec(package) is None:
             extra = "onnx" if backend == "onnxruntime" else "onnx,openvino"
             raise ImportError(f"backend {backend!r} needs {package}: pip install 'auglidar[{extra}]'")
     graph = exported(model, card)
     return onnxruntime_session(graph) if backend == "onnxruntime" else openvino_session(graph)
+
+
+def own_kernels(model: nn.Module) -> Convolutions:
+    """Our Winograd convolutions (`models.winograd`) with as many threads as torch."""
+    if isinstance(model, Selection):
+        return PixelUNetKernels(model.network)
+    assert isinstance(model, Hourglasses), type(model)
+    return hourglass_cpu.convolutions(model)
 
 
 def cache_folder() -> Path:

@@ -28,11 +28,11 @@ class PixelUNetKernels:
         self.network = network
         self.rows = SharedRows(torch.get_num_threads())
         self.stem = _winograd(network.stem)
-        self.encoder: list[list[Any]] = [[_residual(one) for one in stage] for stage in network.encoder]  # type: ignore[union-attr]
+        self.encoder = [[_residual(one) for one in stage.children()] for stage in network.encoder]
         self.down = [(winograd.quarter_weights(one.weight), _bias(one)) for one in network.down]  # type: ignore[arg-type]
         self.up = [(_array(one.weight[:, :, 0, 0].T), _bias(one)) for one in network.up]  # type: ignore[index]
         self.decoder = [_residual(one) for one in network.decoder]
-        self.head = _head(network.head.weight[:, :, 0, 0]), _head(network.head.bias)
+        self.head = _head(network.head.weight[:, :, 0, 0]), _head(_tensor(network.head.bias))
 
     def __call__(self, features: Tensor) -> Tensor:
         """(1, 4 inputs, H/2, W/2) -> (1, 4 outputs, H/2, W/2), like `PixelUNet.at_half`."""
@@ -79,6 +79,11 @@ class PixelUNetKernels:
         out = self.rows.map(name, *skip.shape)
         self.rows.run(winograd.lift, len(x), x, *layer, skip, out)
         return out
+
+
+def _tensor(bias: Tensor | None) -> Tensor:
+    assert bias is not None
+    return bias
 
 
 def _array(x: Tensor) -> Float:

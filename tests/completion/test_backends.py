@@ -17,7 +17,7 @@ from completion.readout import default_read_out
 from tests.completion.scenes import street
 
 SMALL = {"selection": {"width": 8}, "twise": {"channels": 8}, "msg_chn": {"channels": 4}}
-NEEDS = {"onnxruntime": ("onnx", "onnxruntime"), "openvino": ("onnx", "openvino")}
+NEEDS = {"numba": (), "onnxruntime": ("onnx", "onnxruntime"), "openvino": ("onnx", "openvino")}
 
 
 @pytest.fixture(autouse=True)
@@ -35,7 +35,7 @@ def saved(folder: Path, architecture: str, seed: int = 0) -> Path:
     return save_checkpoint(folder / f"{architecture}{seed}", model, Card(spec, default_read_out(spec)))
 
 
-@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
+@pytest.mark.parametrize("backend", sorted(NEEDS))
 @pytest.mark.parametrize("architecture", sorted(SMALL))
 def test_equal_to_torch_within_a_millimetre(tmp_path: Path, architecture: str, backend: str) -> None:
     for package in NEEDS[backend]:
@@ -73,16 +73,12 @@ def test_a_cache_that_cannot_be_written_is_no_obstacle(tmp_path: Path, monkeypat
     assert found.convolutions is not None
 
 
-def test_auto_takes_what_there_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("onnxruntime")
-    path = saved(tmp_path, "twise")
-    found = load_completer(path, backend="auto")
+@pytest.mark.parametrize("architecture", sorted(SMALL))
+def test_auto_needs_no_further_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, architecture: str) -> None:
+    monkeypatch.setattr(backends, "find_spec", lambda name: None)
+    found = load_completer(saved(tmp_path, architecture), backend="auto")
     assert isinstance(found, NetworkCompleter)
     assert found.convolutions is not None
-    monkeypatch.setattr(backends, "find_spec", lambda name: None)
-    without = load_completer(path, backend="auto")
-    assert isinstance(without, NetworkCompleter)
-    assert without.convolutions is None
 
 
 def test_auto_leaves_other_networks_to_torch(tmp_path: Path) -> None:
