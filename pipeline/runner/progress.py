@@ -53,19 +53,21 @@ def _bar(title: str, total: int) -> Iterator[Counter]:
 
 @contextmanager
 def _lines(title: str, total: int) -> Iterator[Counter]:
-    start = last = time.monotonic()
+    start = first = last = time.monotonic()
     done = 0
 
     def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
     def advance() -> None:
-        nonlocal done, last
+        nonlocal done, first, last
         done += 1
         now = time.monotonic()
-        if now - last >= LINE_EVERY_SECONDS and done < total:
+        if done == 1:  # it also compiled kernels and loaded weights, which no later frame does
+            first = last = now
+        elif now - last >= LINE_EVERY_SECONDS and done < total:
             last = now
-            left = (now - start) / done * (total - done)
+            left = (now - first) / (done - 1) * (total - done)
             say(f"{title}: {done} of {total} frames, about {duration(left)} left")
 
     yield Counter(advance, say)
