@@ -50,7 +50,7 @@ PARTS = (
         ("--frames", "4"),
         "1",
     ),
-    Part("Training", ("training",), ("--quick",), "1"),
+    Part("Training", ("training", "--steps", "6"), ("--quick",), "1"),
     Part("Growth of costs", ("scaling",), ("--quick", "--repeats", "1"), "1"),
 )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import numpy as np
@@ -21,12 +22,14 @@ Float = NDArray[np.float32]
 class PixelUNetKernels:
     """The convolutions of a U-Net with its weights at the time of this call, and as many threads as torch has then.
 
-    head         (2, C, 40) and (40,) of bias: what `selection_cpu` reads of the last layer, for even and odd rows
+    head  (2, C, 40) weights and (2, 40) biases: what `selection_cpu` reads of the last layer, for even and odd rows
+    lock  to be held while the result of `before_head` is in use: its memory is kept from frame to frame
     """
 
     def __init__(self, network: PixelUNet) -> None:
         self.network = network
         self.rows = SharedRows(torch.get_num_threads())
+        self.lock = threading.Lock()
         self.stem = _winograd(network.stem)
         self.encoder = [[_residual(one) for one in stage.children()] for stage in network.encoder]
         self.down = [(winograd.quarter_weights(one.weight), _bias(one)) for one in network.down]  # type: ignore[arg-type]
@@ -36,8 +39,8 @@ class PixelUNetKernels:
 
     def __call__(self, features: Tensor) -> Tensor:
         """(1, 4 inputs, H/2, W/2) -> (1, 4 outputs, H/2, W/2), like `PixelUNet.at_half`."""
-        hidden = self.before_head(_array(features[0].permute(1, 2, 0)))
-        with torch.inference_mode():
+        with self.lock, torch.inference_mode():
+            hidden = self.before_head(_array(features[0].permute(1, 2, 0)))
             head: Tensor = self.network.head(F.relu(torch.from_numpy(hidden).permute(2, 0, 1)[None]))
         return head
 

@@ -305,7 +305,8 @@ def complete_mixture(
     out = np.empty((4, height, width), np.float32)
     common = logs, top, np.array(COLUMN_SHIFTS), np.float32(model.residual), shares, read_out == "expected", out
     if isinstance(convolutions, PixelUNetKernels):
-        _in_threads(_read_features, height, convolutions.before_head(features), *convolutions.head, *common)
+        with convolutions.lock:
+            _in_threads(_read_features, height, convolutions.before_head(features), *convolutions.head, *common)
     else:
         run = convolutions or model.network.at_half
         head = run(torch.from_numpy(features).permute(2, 0, 1)[None])
