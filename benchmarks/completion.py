@@ -181,9 +181,9 @@ def roofline(row: Comparison, work: float, traffic: float, products: float, limi
     direct, least, copy_time = work / limits["product"], products / limits["product"], traffic / limits["copy"]
     return (
         f"{work:.1f} GFLOP, {traffic:.2f} GB of layer inputs and outputs ({copy_time:.2f} s at the speed of a copy). A "
-        f"direct convolution at the rate of the matrix product takes {direct:.2f} s: no direct one "
-        f"can be more than {eager / direct:.1f} times faster than eager here. Winograd's leaves {products:.1f} GFLOP of products, {least:.2f} s at that rate; ours "
-        f"takes {ours:.2f} s, of which products at that rate are {100 * least / ours:.0f} %."
+        f"direct convolution at the rate of the matrix product takes {direct:.2f} s: none can be more than "
+        f"{eager / direct:.1f} times faster than eager here. Winograd's leaves {products:.1f} GFLOP of products, "
+        f"{least:.2f} s at that rate; ours takes {ours:.2f} s, {100 * least / ours:.0f} % of it such products."
     )
 
 
