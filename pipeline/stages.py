@@ -211,12 +211,15 @@ def prepare_detect(config: Config) -> FrameFunction:
     from detection.types import PointFrame
 
     detector = load_detector(detector_name(config), config.detection.device, config.seed)
+    raw = uses_raw_lidar(config)
 
     def detect(frame: Frame, files: FrameFiles) -> None:
         camera = frame.calibration
         points = cloud_of(config, frame, files)
         cloud = PointFrame(points, camera.T_cam_velo, camera.P2, frame.image_size, frame.id)
         files.write_detections(result_objects(detector.detect(cloud), cloud))
+        if raw:
+            files.remove_other_presets_cloud()
 
     return detect
 
