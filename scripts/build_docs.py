@@ -38,7 +38,7 @@ API: dict[str, tuple[str, ...]] = {
     ),
 }  # fmt: skip
 # Room for 95 characters of code at 1280 pixels; options do not break at their hyphens (class `whole`); long lines of
-# docstrings and commands wrap, clear of the copy button; pictures drawn for paper stand on white in the dark colours too.
+# docstrings and commands wrap, clear of the copy button; pictures drawn for paper stand on white in dark colours too.
 STYLE = """\
 .md-grid { max-width: 72rem; }
 @media screen and (min-width: 76.25em) {
@@ -63,8 +63,10 @@ STYLE = """\
 # Inline code up to this length stays on one line.
 WHOLE = 24
 OUTSIDE = {
-    "../CONTRIBUTING.md": "contributing.md", "../CHANGELOG.md": "changelog.md", "../benchmarks/RESULTS.md": "benchmarks.md",
-}  # fmt: skip
+    "../CONTRIBUTING.md": "contributing.md",
+    "../CHANGELOG.md": "changelog.md",
+    "../benchmarks/RESULTS.md": "benchmarks.md",
+}
 
 
 def main() -> int:
@@ -115,7 +117,12 @@ def inside_links(text: str) -> str:
     for outside, inside in OUTSIDE.items():
         text = text.replace(f"({outside})", f"({inside})")
     text = re.sub(r"\(\.\./notebooks/([\w-]+)\.ipynb\)", r"(notebooks/\1.md)", text)
-    return re.sub(r"\[`?([^\]`]*)`?\]\(\.\./[^)]*\)", lambda found: f"`{found[1]}`" if "/" in found[1] else found[1], text)
+    return re.sub(r"\[([^\]]*)\]\(\.\./[^)]*\)", lambda found: code(found[1]) if "/" in found[1] else found[1], text)
+
+
+def code(text: str) -> str:
+    """Text as inline code."""
+    return f"`{text.strip('`')}`"
 
 
 def whole_options(text: str) -> str:
