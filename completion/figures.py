@@ -11,7 +11,6 @@ import numpy as np
 from completion.analysis import expected_loss, relative_error_histograms
 from completion.types import FloatMap
 
-
 # Okabe and Ito's blue and orange.
 LOSS, EXPECTED = "#0072B2", "#E69F00"
 
@@ -31,7 +30,7 @@ def loss_curves(gamma: float) -> dict[str, Callable[[Any], Any]]:
 def plot_expected_losses(
     path: Path, depths: tuple[float, float] = (10.0, 13.0), probability: float = 0.5, gamma: float = 2.0
 ) -> Path:
-    """Fig. 2.5 and 4.3: each loss, and below it its expectation at a pixel with two possible depths; minima are black."""
+    """Fig. 2.5 and 4.3: each loss above its expectation at a pixel with two possible depths; minima are black."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

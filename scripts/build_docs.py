@@ -58,6 +58,8 @@ STYLE = """\
 .md-nav--primary .md-nav__item .md-nav__link--active { color: var(--md-typeset-a-color); }
 @media (max-width: 40em) {
   .md-typeset table:not([class]) th, .md-typeset table:not([class]) td { padding: 0.4em 0.5em; }
+  .md-typeset table code, .md-typeset table code.whole { white-space: normal; overflow-wrap: anywhere; }
+  .md-typeset table td:has(code) { min-width: 6.5em; }
 }
 """
 # Inline code up to this length stays on one line.
@@ -98,7 +100,10 @@ def write_sources(out: Path) -> None:
     for name in ("CONTRIBUTING", "CHANGELOG"):
         text = (ROOT / f"{name}.md").read_text(encoding="utf-8")
         (out / f"{name.lower()}.md").write_text(text.replace("(docs/", "("), encoding="utf-8")
-    shutil.copy(ROOT / "benchmarks" / "RESULTS.md", out / "benchmarks.md")
+    results = (ROOT / "benchmarks" / "RESULTS.md").read_text(encoding="utf-8")
+    head, tables = results.split("\n## ", 1)
+    tables = re.sub(r"^(?![|#`!\s-])(.+)$", r"\1  ", tables, flags=re.MULTILINE)  # what was printed keeps its lines
+    (out / "benchmarks.md").write_text(f"{head}\n## {tables}", encoding="utf-8")
     shutil.copy(ROOT / "benchmarks" / "RESULTS.png", out)
     (out / "notebooks").mkdir()
     for notebook in sorted((ROOT / "notebooks").glob("*.ipynb")):
@@ -109,7 +114,7 @@ def write_sources(out: Path) -> None:
     for page in out.glob("*.md"):
         page.write_text(inside_links(page.read_text(encoding="utf-8")), encoding="utf-8")
     for page in out.rglob("*.md"):
-        page.write_text(whole_options(page.read_text(encoding="utf-8")), encoding="utf-8")
+        page.write_text(opening_pictures(whole_options(page.read_text(encoding="utf-8"))), encoding="utf-8")
 
 
 def inside_links(text: str) -> str:
@@ -130,6 +135,11 @@ def whole_options(text: str) -> str:
     pieces = re.split(r"(^```.*?^```)", text, flags=re.MULTILINE | re.DOTALL)
     short = re.compile(rf"(?<!`)(`(?=[^`\n]*-)[^`\n]{{1,{WHOLE}}}`)(?!`)")
     return "".join(piece if piece.startswith("```") else short.sub(r"\1{ .whole }", piece) for piece in pieces)
+
+
+def opening_pictures(text: str) -> str:
+    """Pictures that stand alone open in full size: their small print is too small on a phone."""
+    return re.sub(r"^(!\[[^\]]*\]\(([^)\s]+)\))$", r"[\1](\2)", text, flags=re.MULTILINE)
 
 
 def notebook_page(notebook: Path) -> str:
