@@ -120,7 +120,7 @@ def augment_settings(config: Config) -> AugmentSettings:
     section = config.augment
     if section.preset not in PRESETS:
         raise UsageError(f"augment.preset: unknown preset {section.preset!r}; {nearest_name(section.preset, PRESETS)}")
-    settings = with_changes(PRESETS[section.preset], section.library, "augment")
+    settings = with_changes(PRESETS[section.preset], section.library, "augment", type(section).model_fields)
     if settings.needs_semantics and section.semantics is None:
         raise UsageError(
             f"augment.preset {section.preset} needs object masks: set augment.semantics to truth, boxes, files:FOLDER, "
