@@ -58,8 +58,7 @@ STYLE = """\
 .md-nav--primary .md-nav__item .md-nav__link--active { color: var(--md-typeset-a-color); }
 @media (max-width: 40em) {
   .md-typeset table:not([class]) th, .md-typeset table:not([class]) td { padding: 0.4em 0.5em; }
-  .md-typeset table code, .md-typeset table code.whole { white-space: normal; overflow-wrap: anywhere; }
-  .md-typeset table td:has(code) { min-width: 6.5em; }
+  .md-typeset table code.whole { white-space: normal; }
 }
 """
 # Inline code up to this length stays on one line.
@@ -134,7 +133,23 @@ def whole_options(text: str) -> str:
     """Short inline code with a hyphen gets the class that keeps it on one line; fenced blocks stay as they are."""
     pieces = re.split(r"(^```.*?^```)", text, flags=re.MULTILINE | re.DOTALL)
     short = re.compile(rf"(?<!`)(`(?=[^`\n]*-)[^`\n]{{1,{WHOLE}}}`)(?!`)")
-    return "".join(piece if piece.startswith("```") else short.sub(r"\1{ .whole }", piece) for piece in pieces)
+
+    def line_by_line(piece: str) -> str:
+        return "\n".join(
+            re.sub(r"`([^`\n]+)`", breakable, line) if line.startswith("|") else short.sub(r"\1{ .whole }", line)
+            for line in piece.split("\n")
+        )
+
+    return "".join(piece if piece.startswith("```") else line_by_line(piece) for piece in pieces)
+
+
+def breakable(code: re.Match[str]) -> str:
+    """Inline code of a table as HTML that a narrow column may break after _ / . = and commas."""
+    text = code[1].replace("\\|", "|")
+    kind = ' class="whole"' if "-" in text and len(text) <= WHOLE else ""
+    pieces = re.split(r"(?<=[_/.=,])(?=\w)", text) if len(text) > 10 else [text]
+    safe = ("".join(f"&#{ord(c)};" if c in "<>&|*_[]~^" else c for c in piece) for piece in pieces)
+    return f"<code{kind}>{'<wbr>'.join(safe)}</code>"
 
 
 def opening_pictures(text: str) -> str:
