@@ -131,7 +131,7 @@ def main() -> int:
 
 def results(head: str, measures: list[Measure], worse: list[str], wrong: list[str], sections: list[str]) -> str:
     """RESULTS.md."""
-    compared = "\n".join(f"- {line}" for line in worse) or "No ratio fell by more than a fifth of the baseline's."
+    compared = "\n".join(f"- {line}" for line in worse) or "- No ratio fell by more than a fifth of the baseline's."
     doubts = "".join(f"\n- {case}: **results disagree**" for case in wrong)
     picture = "![Times better than each best peer, and how costs grow](RESULTS.png)"
     top = f"# Benchmarks\n\n{head}\n\n## Targets\n\n{summary(measures)}\n{compared}{doubts}\n\n{picture}\n"

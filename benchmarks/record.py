@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.timing import Comparison
+from benchmarks.timing import Comparison, three_digits
 
 
 @dataclass(frozen=True)
@@ -101,4 +101,4 @@ def shown(value: float, unit: str) -> str:
         return "-"
     if unit == "s":
         return f"{value:.2f} s" if value >= 1 else f"{value * 1e3:.3g} ms"
-    return f"{value:.3g} {unit}"
+    return f"{three_digits(value)} {unit}"

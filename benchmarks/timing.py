@@ -50,7 +50,15 @@ class Comparison:
 
 
 def _milliseconds(timing: Timing) -> str:
-    return f"{timing.median * 1e3:.3g} ms [{min(timing.seconds) * 1e3:.3g}-{max(timing.seconds) * 1e3:.3g}]"
+    median, least, most = (
+        three_digits(1e3 * value) for value in (timing.median, min(timing.seconds), max(timing.seconds))
+    )
+    return f"{median} ms [{least}-{most}]"
+
+
+def three_digits(value: float) -> str:
+    """Three digits, or all before the point: 0.0123, 12.3, 1,340."""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def thread_counts() -> dict[str, int]:

@@ -18,7 +18,7 @@ STAGE_HELP = {
     "complete": "sparse depth + image -> dense depth with two surfaces",
     "augment": "dense depth -> augmented LiDAR",
     "detect": "cloud -> 3D boxes as KITTI result files",
-    "evaluate": "AP and depth errors of a run (or of two folders, see --stage evaluate --help)",
+    "evaluate": "AP and depth errors of a run (two folders: --stage evaluate --help)",
     "report": "everything above and one HTML page",
 }
 
@@ -26,19 +26,20 @@ EXAMPLES = """\
 examples:
   run_pipeline
       the demo: synthetic data, every stage, AP table and report in runs/demo
-  run_pipeline --config configs/kitti.yaml --stage detect --data KITTI --out runs/kitti --workers 4
-      completed depth, twin surfaces, augmented cloud and detections of every frame
-  run_pipeline --stage report --out runs/kitti
+  run_pipeline --config configs/kitti.yaml --stage detect --data KITTI --out RUN
+      depth, twin surfaces, augmented cloud and detections of every frame
+  run_pipeline --stage report --out RUN
       scores and report of that run, with its own configuration
-  run_pipeline --config configs/kitti.yaml --data KITTI --frames 0:100 --set augment.preset=D_F --dry-run
+  run_pipeline --data KITTI --config configs/kitti.yaml --frames 0:100 --dry-run
       what would be done: frames, files, GB, minutes
-  run_pipeline --stage report --out runs/kitti --json result.json
+  run_pipeline --stage report --out RUN --json result.json
       frames done and failed per stage, scores and paths, for a script
-  run_pipeline --stage evaluate --labels KITTI/training/label_2 --detections runs/kitti/detections
+  run_pipeline --stage evaluate --labels LABELS --detections RUN/detections
       AP of any two folders
 
-A command that was stopped or killed continues where it was when it is given again.
-Exit codes: 0 done; 1 some frames failed (failures.json in the run folder); 2 the request cannot be carried out.
+A command that was stopped or killed continues when it is given again.
+Exit codes: 0 done; 1 some frames failed (RUN/failures.json); 2 the request
+cannot be carried out.
 """
 
 
@@ -114,7 +115,8 @@ def main_parser(verbs: dict[str, str]) -> argparse.ArgumentParser:
     others = "".join(f"  {name:<11}{about}\n" for name, about in verbs.items() if name not in STAGE_HELP)
     parser = argparse.ArgumentParser(
         prog="run_pipeline",
-        description="Sparse LiDAR + one image -> dense depth -> augmented LiDAR -> 3D detections, scored by KITTI AP.\n"
+        description="Sparse LiDAR + one image -> dense depth -> augmented LiDAR -> 3D detections,\n"
+        "scored by KITTI AP. "
         "Without arguments: the demo on synthetic data.",
         epilog=f"stages (a stage runs what it needs before it):\n{stages}\n"
         + (f"verbs (own options: run_pipeline --stage VERB --help):\n{others}\n" if others else "")

@@ -110,6 +110,15 @@ class FrameFiles:
             raise DataError(path, "JSON written by the augment stage", "something else", _REDO) from None
         return record
 
+    def remove_other_presets_cloud(self) -> None:
+        """Removes an augmented cloud that lies here from before the run went back to raw LiDAR (preset L).
+
+        Report and exports would take it for what the detector saw; a cloud without completed points stays.
+        """
+        if self.run.cloud(self.id).is_file() and self.read_cloud()[:, 4].any():
+            for path in (self.run.cloud(self.id), self.run.counts(self.id), self.run.cloud_columns(self.id)):
+                path.unlink(missing_ok=True)
+
     def write_detections(self, objects: list[KittiObject]) -> None:
         """detections/ID.txt, empty when nothing is found."""
         self._write(self.run.detections(self.id), "".join(format_line(item) + "\n" for item in objects).encode())

@@ -20,7 +20,15 @@ from pipeline.runner.jobs import Outcome, Task
 from pipeline.runner.processes import available_cores
 from pipeline.runner.signals import StopRequest, stop_on_signals
 from pipeline.settings import nearest_name
-from pipeline.stages import FRAME_STAGES, STAGES, data_root, frame_stages_for, has_points, open_frames
+from pipeline.stages import (
+    FRAME_STAGES,
+    STAGES,
+    augment_settings,
+    data_root,
+    frame_stages_for,
+    has_points,
+    open_frames,
+)
 from pipeline.summary import print_dry_run, print_results, print_summary, run_record
 from pipeline.versions import made_with
 
@@ -58,6 +66,8 @@ def carry_out(request: Request, record: dict[str, Any] | None = None) -> int:
     run = RunFolder(out)
     stage = request.stage or "report"
     check_request(request, stage)
+    if "augment" in frame_stages_for(stage, config):
+        augment_settings(config)  # a misspelt preset is refused before anything is written or promised
     record |= {"run": str(run.root), "stage": stage}
     if request.dry_run:
         record["estimates"] = dry_run(config, run, stage, request.shard)

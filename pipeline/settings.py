@@ -20,10 +20,11 @@ def nearest_name(name: str, known: Iterable[str]) -> str:
     return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names)}"
 
 
-def with_changes(base: T, changes: Mapping[str, Any], where: str) -> T:
+def with_changes(base: T, changes: Mapping[str, Any], where: str, others: Iterable[str] = ()) -> T:
     """`base`, a (nested) frozen dataclass, with the fields of `changes` replaced and checked against their types.
 
-    where  dotted name of the section, put in front of messages ("augment")
+    where   dotted name of the section, put in front of messages ("augment")
+    others  names that the section knows beside these fields, for the suggestion in a message
     A field that holds a dataclass takes a mapping of its own fields; a field that may be None takes null.
     Raises UsageError for an unknown field (with the nearest known one) or a value that does not fit.
     """
@@ -32,7 +33,7 @@ def with_changes(base: T, changes: Mapping[str, Any], where: str) -> T:
     new: dict[str, Any] = {}
     for key, value in changes.items():
         if key not in fields:
-            raise UsageError(f"unknown setting {where}.{key}; {nearest_name(key, fields)}")
+            raise UsageError(f"unknown setting {where}.{key}; {nearest_name(key, [*others, *fields])}")
         new[key] = _fitting(hints[key], getattr(base, key), value, f"{where}.{key}")
     try:
         return dataclasses.replace(base, **new)  # type: ignore[type-var]

@@ -120,7 +120,7 @@ def augment_settings(config: Config) -> AugmentSettings:
     section = config.augment
     if section.preset not in PRESETS:
         raise UsageError(f"augment.preset: unknown preset {section.preset!r}; {nearest_name(section.preset, PRESETS)}")
-    settings = with_changes(PRESETS[section.preset], section.library, "augment")
+    settings = with_changes(PRESETS[section.preset], section.library, "augment", type(section).model_fields)
     if settings.needs_semantics and section.semantics is None:
         raise UsageError(
             f"augment.preset {section.preset} needs object masks: set augment.semantics to truth, boxes, files:FOLDER, "
@@ -211,12 +211,15 @@ def prepare_detect(config: Config) -> FrameFunction:
     from detection.types import PointFrame
 
     detector = load_detector(detector_name(config), config.detection.device, config.seed)
+    raw = uses_raw_lidar(config)
 
     def detect(frame: Frame, files: FrameFiles) -> None:
         camera = frame.calibration
         points = cloud_of(config, frame, files)
         cloud = PointFrame(points, camera.T_cam_velo, camera.P2, frame.image_size, frame.id)
         files.write_detections(result_objects(detector.detect(cloud), cloud))
+        if raw:
+            files.remove_other_presets_cloud()
 
     return detect
 

@@ -50,24 +50,24 @@ def table(real: dict[str, Any]) -> list[str]:
         if ours and linear:
             rows.append(
                 f"| depth from {count} of 64 LiDAR rows, mean error | {frames}, the other rows "
-                f"| {ours['mae'] / 1000:.2f} m | linear interpolation {linear['mae'] / 1000:.2f} m |"
+                f"| {ours['mae'] / 1000:.2f}\u00a0m | linear interpolation {linear['mae'] / 1000:.2f}\u00a0m |"
             )
             rows.append(
                 "| at depth edges, share of pixels in the air between the surfaces | the same "
-                f"| {ours['mixed']:.0f} % | linear interpolation {linear['mixed']:.0f} % |"
+                f"| {ours['mixed']:.0f}\u00a0% | linear interpolation {linear['mixed']:.0f}\u00a0% |"
             )
     found = [car_row(real, name, 64) for name in names]
     if all(found):
         cells = [
             "{} of {}".format(*row["found"]["moderate"]) + f", precision {row['precision']:.2f}" for row in found if row
         ]
-        where = f"{frames}, moderate, from above at IoU 0.5"
+        where = f"{frames}, moderate, from above at IoU\u00a00.5"
         rows.append(f"| cars found | {where} | augmented {cells[0]}; raw LiDAR {cells[1]} | |")
     held = [held_out(name) for name in names]
     for kind, iou in (("Car", 0.7), ("Pedestrian", 0.5), ("Cyclist", 0.5)):
         values = [record["ap_r40"].get(f"{kind} 3d {iou}", [None, None])[1] for record in held]
         if None not in values:
-            where = f"{held[0]['frames']} held-out synthetic frames, moderate, IoU {iou}"
+            where = f"{held[0]['frames']} held-out synthetic frames, moderate, IoU\u00a0{iou}"
             rows.append(f"| {kind} 3D AP R40 | {where} | augmented {values[0]:.1f}; raw LiDAR {values[1]:.1f} | |")
     return rows
 

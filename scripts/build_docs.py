@@ -37,17 +37,37 @@ API: dict[str, tuple[str, ...]] = {
         "pipeline.pointcloud.pseudo_sigma", "pipeline.simulation.synth", "pipeline.simulation.noise", "pipeline.config",
     ),
 }  # fmt: skip
-# Long lines of docstrings and commands wrap; pictures drawn for paper stand on white in the dark colours too.
+# Room for 95 characters of code at 1280 pixels; options do not break at their hyphens (class `whole`); long lines of
+# docstrings and commands wrap, clear of the copy button; pictures drawn for paper stand on white in dark colours too.
 STYLE = """\
-.language-text code, .language-sh code, .language-bash code { white-space: pre-wrap; overflow-wrap: anywhere; }
+.md-grid { max-width: 72rem; }
+@media screen and (min-width: 76.25em) {
+  .md-sidebar--primary { width: 10.8rem; }
+  .md-sidebar--secondary { width: 9.3rem; }
+  [dir="ltr"] .md-sidebar--primary:not([hidden]) ~ .md-content { margin-left: 0.6rem; }
+}
+.md-typeset pre > code { font-size: 0.8em; }
+.language-text code, .language-sh code, .language-bash code {
+  white-space: pre-wrap; overflow-wrap: anywhere; padding-right: 2.8em;
+}
+.md-typeset code.whole { white-space: nowrap; }
 .md-typeset img { background: white; border-radius: 4px; }
 .md-typeset img[src$="webp"] { border: 1px solid var(--md-default-fg-color--lightest); }
 .md-typeset table code { word-break: normal; overflow-wrap: break-word; }
+.md-typeset table:not([class]) th, .md-typeset table:not([class]) td { padding: 0.6em 0.8em; min-width: 0; }
+.md-nav--primary .md-nav__item .md-nav__link--active { color: var(--md-typeset-a-color); }
 @media (max-width: 40em) {
-  .md-typeset table:not([class]) th, .md-typeset table:not([class]) td { padding: 0.4em 0.5em; min-width: 0; }
+  .md-typeset table:not([class]) th, .md-typeset table:not([class]) td { padding: 0.4em 0.5em; }
+  .md-typeset table code.whole { white-space: normal; }
 }
 """
-OUTSIDE = {"../CONTRIBUTING.md": "contributing.md", "../CHANGELOG.md": "changelog.md"}
+# Inline code up to this length stays on one line.
+WHOLE = 24
+OUTSIDE = {
+    "../CONTRIBUTING.md": "contributing.md",
+    "../CHANGELOG.md": "changelog.md",
+    "../benchmarks/RESULTS.md": "benchmarks.md",
+}
 
 
 def main() -> int:
@@ -65,6 +85,7 @@ def main() -> int:
     zensical_program = Path(sys.executable).with_name("zensical")
     done = subprocess.run([zensical_program, "build", "--clean", "--strict"], cwd=ROOT, check=False)
     if done.returncode == 0:
+        (ROOT / "site" / "404.html").unlink(missing_ok=True)  # for servers; its style has an absolute address
         print(f"open {ROOT / 'site' / 'index.html'}")
     return done.returncode
 
@@ -72,11 +93,17 @@ def main() -> int:
 def write_sources(out: Path) -> None:
     """Everything Zensical reads, freshly into `out`."""
     shutil.rmtree(out, ignore_errors=True)
-    shutil.copytree(ROOT / "docs", out, ignore=shutil.ignore_patterns("*.py"))
+    shutil.copytree(ROOT / "docs", out, ignore=shutil.ignore_patterns("*.py", "synthetic_statistics.md"))
     (out / "site.css").write_text(STYLE, encoding="utf-8")
+    shutil.copy(ROOT / "scripts" / "iframe-worker.js", out)
     for name in ("CONTRIBUTING", "CHANGELOG"):
         text = (ROOT / f"{name}.md").read_text(encoding="utf-8")
         (out / f"{name.lower()}.md").write_text(text.replace("(docs/", "("), encoding="utf-8")
+    results = (ROOT / "benchmarks" / "RESULTS.md").read_text(encoding="utf-8")
+    head, tables = results.split("\n## ", 1)
+    tables = re.sub(r"^(?![|#`!\s-])(.+)$", r"\1  ", tables, flags=re.MULTILINE)  # what was printed keeps its lines
+    (out / "benchmarks.md").write_text(f"{head}\n## {tables}", encoding="utf-8")
+    shutil.copy(ROOT / "benchmarks" / "RESULTS.png", out)
     (out / "notebooks").mkdir()
     for notebook in sorted((ROOT / "notebooks").glob("*.ipynb")):
         (out / "notebooks" / f"{notebook.stem}.md").write_text(notebook_page(notebook), encoding="utf-8")
@@ -85,6 +112,8 @@ def write_sources(out: Path) -> None:
         (out / "api" / f"{room}.md").write_text(api_page(room, modules), encoding="utf-8")
     for page in out.glob("*.md"):
         page.write_text(inside_links(page.read_text(encoding="utf-8")), encoding="utf-8")
+    for page in out.rglob("*.md"):
+        page.write_text(opening_pictures(whole_options(page.read_text(encoding="utf-8"))), encoding="utf-8")
 
 
 def inside_links(text: str) -> str:
@@ -92,7 +121,40 @@ def inside_links(text: str) -> str:
     for outside, inside in OUTSIDE.items():
         text = text.replace(f"({outside})", f"({inside})")
     text = re.sub(r"\(\.\./notebooks/([\w-]+)\.ipynb\)", r"(notebooks/\1.md)", text)
-    return re.sub(r"\[([^\]]*)\]\(\.\./[^)]*\)", r"\1", text)
+    return re.sub(r"\[([^\]]*)\]\(\.\./[^)]*\)", lambda found: code(found[1]) if "/" in found[1] else found[1], text)
+
+
+def code(text: str) -> str:
+    """Text as inline code."""
+    return f"`{text.strip('`')}`"
+
+
+def whole_options(text: str) -> str:
+    """Short inline code with a hyphen gets the class that keeps it on one line; fenced blocks stay as they are."""
+    pieces = re.split(r"(^```.*?^```)", text, flags=re.MULTILINE | re.DOTALL)
+    short = re.compile(rf"(?<!`)(`(?=[^`\n]*-)[^`\n]{{1,{WHOLE}}}`)(?!`)")
+
+    def line_by_line(piece: str) -> str:
+        return "\n".join(
+            re.sub(r"`([^`\n]+)`", breakable, line) if line.startswith("|") else short.sub(r"\1{ .whole }", line)
+            for line in piece.split("\n")
+        )
+
+    return "".join(piece if piece.startswith("```") else line_by_line(piece) for piece in pieces)
+
+
+def breakable(code: re.Match[str]) -> str:
+    """Inline code of a table as HTML that a narrow column may break after _ / . = and commas."""
+    text = code[1].replace("\\|", "|")
+    kind = ' class="whole"' if "-" in text and len(text) <= WHOLE else ""
+    pieces = re.split(r"(?<=[_/.=,])(?=\w)", text) if len(text) > 10 else [text]
+    safe = ("".join(f"&#{ord(c)};" if c in "<>&|*_[]~^" else c for c in piece) for piece in pieces)
+    return f"<code{kind}>{'<wbr>'.join(safe)}</code>"
+
+
+def opening_pictures(text: str) -> str:
+    """Pictures that stand alone open in full size: their small print is too small on a phone."""
+    return re.sub(r"^(!\[[^\]]*\]\(([^)\s]+)\))$", r"[\1](\2)", text, flags=re.MULTILINE)
 
 
 def notebook_page(notebook: Path) -> str:
@@ -189,7 +251,12 @@ def paragraph(text: str) -> str:
     if re.search(r"\S {2,}\S", text) or text.startswith(" ") or " = " in text.splitlines()[0]:
         return f"```text\n{text}\n```"
     pieces = re.split(r"(`[^`]*`)", " ".join(text.split()))
-    return "".join(p if p.startswith("`") else re.sub(r"([*_<\[\]])", r"\\\1", p) for p in pieces)
+    return "".join(p if p.startswith("`") else plain(p) for p in pieces)
+
+
+def plain(text: str) -> str:
+    """Text in which Markdown finds nothing."""
+    return re.sub(r"([*_\[\]])", r"\\\1", text).replace("<", "&lt;")
 
 
 if __name__ == "__main__":

@@ -73,9 +73,17 @@ class Page:
         """Height of the whole page, CSS pixels."""
         return int(self.run("document.documentElement.scrollHeight"))
 
-    def picture(self, path: Path, selector: str | None = None, margin: int = 0) -> Path:
-        """PNG of the page, or of one element with some margin around it."""
-        if selector is None:
+    def picture(
+        self,
+        path: Path,
+        selector: str | None = None,
+        margin: int = 0,
+        area: tuple[float, float, float, float] | None = None,
+    ) -> Path:
+        """PNG of the page, of one element with some margin around it, or of an area (left, top, width, height)."""
+        if area is not None:
+            left, top, width, height = area
+        elif selector is None:
             left, top, width, height = 0.0, 0.0, float(self.width), float(min(self.height(), TALLEST))
         else:
             place = self.run(

@@ -26,7 +26,8 @@ def main() -> int:
     address = (run / "report" / "index.html").resolve().as_uri()
     with Chromium() as browser:
         page = browser.open(address, 1280, 820)
-        save(page, "report_summary", None, height=1080)
+        bottom = page.run("document.querySelector('section:has(.curves)').getBoundingClientRect().bottom + scrollY")
+        save(page, "report_summary", None, height=round(bottom) + 16)
         open_cloud(page, 2)
         save(page, "report_maps", "article:nth-of-type(2) .maps")
         page.run(f"document.head.insertAdjacentHTML('beforeend', '<style>{ONE_FRAME}</style>')")

@@ -33,9 +33,9 @@ def draw_fps(result: TableResult, figure: Any) -> None:
             axis.plot(range(len(values)), values, f"{marker}-", color=colour, label=FPS_INPUTS[preset])
         axis.set_xticks(range(len(_FPS_VIEWS)), list(_FPS_VIEWS.values()), rotation=40, ha="right", fontsize=8)
         axis.set_title(f"{column.title}, %", fontsize=10)
-        axis.set(ylim=(0, None))
+        axis.set_ylim(0, 1.06 * axis.dataLim.y1)
         axis.grid(alpha=0.3)
-    axes[0].legend(fontsize=8)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(FPS_INPUTS), fontsize=8)
 
 
 def draw_sigma(result: TableResult, figure: Any) -> None:
@@ -117,9 +117,9 @@ def draw_noise(result: TableResult, figure: Any) -> None:
 
     for axis, kind in zip(axes, ("blur", "misalignment")):
         steps = [strength for name, strength, _ in noise_steps() if name == kind]
-        for regime, colour, marker in ((CLEAN, BLUE, "o"), (NOISY, ORANGE, "s")):
+        for regime, colour, marker, aside in ((CLEAN, BLUE, "o", -0.05), (NOISY, ORANGE, "s", 0.05)):
             found = [value("noise-free"), *(value(noise_label(kind, strength, regime)) for strength in steps)]
-            done = [(place, one) for place, one in enumerate(found) if one is not None]
+            done = [(place + aside, one) for place, one in enumerate(found) if one is not None]
             axis.plot([p for p, _ in done], [one.mean for _, one in done], f"{marker}-", color=colour, label=regime)
             for place, one in done:
                 axis.plot([place] * 2, [one.low, one.high], color=colour, linewidth=1.5)

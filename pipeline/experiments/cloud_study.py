@@ -190,7 +190,8 @@ def sweep_figure(sweep: SigmaSweep, settings: AugmentSettings, path: Path) -> Pa
         axis.set_xticks(range(len(LOWS)), [f"{low:g}" for low in LOWS])
         axis.set_yticks(range(len(GAPS)), [f"{gap:g}" for gap in GAPS])
         for i, j in np.ndindex(share.shape):
-            axis.text(i, j, f"{share[i, j]:.1f}", ha="center", va="center", color="white", fontsize=7)
+            colour = "white" if share[i, j] < (share.min() + share.max()) / 2 else "black"
+            axis.text(i, j, f"{share[i, j]:.1f}", ha="center", va="center", color=colour, fontsize=7)
         figure.colorbar(image, ax=axis)
     figure.savefig(path, dpi=110)
     return path

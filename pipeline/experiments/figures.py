@@ -11,8 +11,9 @@ from pipeline.experiments.intervals import Estimate, estimate
 from pipeline.experiments.plan import TableResult
 from pipeline.experiments.tables import Column, Row
 
-# Okabe and Ito's palette: blue ours, orange the thesis'.
+# Okabe and Ito's palette: blue ours, orange the thesis'. Their numbers are set darker, to be read on white.
 OURS, THEIRS, THIRD = "#0072B2", "#E69F00", "#009E73"
+THEIR_NUMBERS = "#8A5F00"
 MARKERS = "osD^vPX"
 
 
@@ -48,7 +49,7 @@ def draw_dots(result: TableResult, figure: Any) -> None:
         axis.tick_params(axis="x", labelcolor=OURS, labelsize=7)
         axis.grid(axis="y", alpha=0.3)
         if other is not None:
-            other.tick_params(axis="x", labelcolor=THEIRS, labelsize=7)
+            other.tick_params(axis="x", labelcolor=THEIR_NUMBERS, labelsize=7)
     axes[0].set_yticks(range(len(table.rows)), [row.label for row in table.rows], fontsize=8)
     axes[0].set_ylim(len(table.rows) - 0.5, -0.5)
 
@@ -65,32 +66,37 @@ def _series(result: TableResult) -> dict[str, list[tuple[str, Row]]]:
 
 def draw_curve(result: TableResult, figure: Any) -> None:
     """A panel per column: value against gamma or LiDAR rows; ours solid with intervals, the thesis' dashed."""
-    table = result.table
+    table, series = result.table, _series(result)
     axes = figure.subplots(1, len(table.columns), squeeze=False)[0]
-    colours = dict(zip(_series(result), (OURS, THEIRS, THIRD, "#CC79A7", "#56B4E9")))
+    colours = dict(zip(series, (OURS, THEIRS, THIRD, "#CC79A7", "#56B4E9")))
+    # Intervals of several series stand side by side.
+    aside = {name: 0.12 * (number - (len(series) - 1) / 2) for number, name in enumerate(series)}
     for index, (axis, column) in enumerate(zip(axes, table.columns)):
         printed_axis = (
             axis.twinx() if any(row.printed and row.printed[index] is not None for row in table.rows) else None
         )
-        for marker, (name, rows) in zip(MARKERS, _series(result).items()):
-            found = [(position, _ours(result, row, column)) for position, (_, row) in enumerate(rows)]
+        for marker, (name, rows) in zip(MARKERS, series.items()):
+            found = [(position + aside[name], _ours(result, row, column)) for position, (_, row) in enumerate(rows)]
             done = [(position, one) for position, one in found if one is not None]
             axis.plot(
-                [p for p, _ in done], [one.mean for _, one in done], f"{marker}-", color=colours[name], label=name
+                [p for p, _ in done], [one.mean for _, one in done], f"{marker}-", ms=5, color=colours[name], label=name
             )
             for position, one in done:
                 axis.plot([position] * 2, [one.low, one.high], color=colours[name], linewidth=1.5)
-            theirs = [(p, row.printed[index]) for p, (_, row) in enumerate(rows) if row.printed]
+            theirs = [(p + aside[name], row.printed[index]) for p, (_, row) in enumerate(rows) if row.printed]
             theirs = [(p, value) for p, value in theirs if value is not None]
             if printed_axis is not None:
                 printed_axis.plot(*zip(*theirs), f"{marker}--", color=colours[name], alpha=0.5, markersize=4)
-        ticks = [tick for tick, _ in next(iter(_series(result).values()))]
+        ticks = [tick for tick, _ in next(iter(series.values()))]
         axis.set_xticks(range(len(ticks)), ticks, fontsize=8)
         axis.set_title(column.heading, fontsize=9)
         axis.tick_params(axis="y", labelsize=7)
         if printed_axis is not None:
-            printed_axis.tick_params(axis="y", labelsize=7, colors="grey")
-    axes[0].legend(fontsize=7)
+            printed_axis.tick_params(axis="y", labelsize=7, colors="dimgrey")
+        if len(series) == 1:
+            axis.set_xlabel(next(iter(series)), fontsize=8)
+    if len(series) > 1:
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(series), fontsize=8)
 
 
 def draw_scatter(result: TableResult, figure: Any) -> None:
@@ -113,7 +119,10 @@ def draw_scatter(result: TableResult, figure: Any) -> None:
             for x, y, loss in found:
                 axis.annotate(loss, (x, y), textcoords="offset points", xytext=(4, 4), fontsize=7)
         axis.set(xlabel=f"{column.heading}, clean", ylabel=f"{column.heading}, semi-dense")
-        axis.legend(fontsize=8)
+        axis.grid(alpha=0.3)
+        axis.margins(0.12)
+        if points:
+            axis.legend(fontsize=8)
 
 
 def draw_expected_loss(result: TableResult, figure: Any) -> None:
@@ -133,7 +142,7 @@ def draw_expected_loss(result: TableResult, figure: Any) -> None:
         error, depth = np.linspace(-3, 3, 601), np.linspace(near - 2, far + 2, 1401)
         shares = (settings["probability"], 1 - settings["probability"])
         axes[0, column].plot(error, loss(error), color=OURS)
-        axes[0, column].set(title=row.label, xlabel="estimate - truth [m]")
+        axes[0, column].set(title=row.label.replace("^2", "²"), xlabel="estimate - truth [m]")
         axes[1, column].plot(depth, expected_loss(loss, depth, (near, far), shares), color=THEIRS)
         axes[1, column].set(xlabel="estimate [m]", ylabel="expected loss" if column == 0 else "")
         for x in (near, far):
@@ -148,7 +157,7 @@ def draw_relative_errors(result: TableResult, figure: Any) -> None:
 
     folder = result.folders[next(iter(result.outcomes))][0]
     with np.load(folder / "maps.npz") as maps:
-        both = {"absolute error [m]": maps["absolute"], "squared error [m^2]": maps["squared"]}
+        both = {"absolute error [m]": maps["absolute"], "squared error [m²]": maps["squared"]}
     axes = figure.subplots(2, 2)
     for column, ((title, stack), limit) in enumerate(zip(both.items(), (2.0, 10.0))):
         shown = axes[0, column].imshow(stack[0], cmap="PuOr_r", vmin=-limit, vmax=limit)
@@ -164,11 +173,14 @@ def draw_relative_errors(result: TableResult, figure: Any) -> None:
 
 def draw_error_maps(result: TableResult, figure: Any) -> None:
     """Fig. 4.9: image above, absolute error from 0 to 5 m below, a line per network."""
+    import matplotlib
     import numpy as np
 
     files = {label: result.folders[label][0] / "examples.npz" for label in result.outcomes}
     with np.load(next(iter(files.values()))) as examples:
         frames = sum(name.startswith("image_") for name in examples.files)  # one where only one was tested
+    colours = matplotlib.colormaps["magma"].with_extremes(bad="#9AA0A6")
+    figure.set_size_inches(11, 0.9 + (1.75 if frames > 1 else 3) * (1 + len(files)))
     axes = figure.subplots(1 + len(files), frames, squeeze=False)
     for line, (label, path) in enumerate(files.items(), start=1):
         with np.load(path) as examples:
@@ -176,11 +188,11 @@ def draw_error_maps(result: TableResult, figure: Any) -> None:
                 target = examples[f"clean_{column}"].astype(np.float32)
                 error = np.abs(examples[f"depth_{column}"].astype(np.float32) - target)
                 axes[0, column].imshow(examples[f"image_{column}"])
-                shown = axes[line, column].imshow(np.where(target > 0, error, np.nan), cmap="magma", vmin=0, vmax=5)
+                shown = axes[line, column].imshow(np.where(target > 0, error, np.nan), cmap=colours, vmin=0, vmax=5)
                 axes[line, column].set_title(label, fontsize=8)
     for axis in axes.ravel():
         axis.set_axis_off()
-    figure.colorbar(shown, ax=axes[1:], label="error [m]", shrink=0.8)
+    figure.colorbar(shown, ax=axes, label="error [m]; grey: no true depth", shrink=0.7)
 
 
 DRAWINGS: dict[str, Callable[[TableResult, Any], None]] = {
@@ -197,6 +209,8 @@ LEGENDS = {
     "curve": "solid: ours with 95 % interval; dashed: thesis (right axis)",
     "scatter": "means over seeds",
 }
+# Where the thesis prints no number.
+OURS_ALONE = {"dots": "dots: ours with 95 % interval", "curve": "ours with 95 % interval"}
 
 
 def draw(result: TableResult, path: Path) -> Path | None:
@@ -208,7 +222,8 @@ def draw(result: TableResult, path: Path) -> Path | None:
     size = (3 + 1.9 * len(table.columns), 1.8 + 0.28 * len(table.rows)) if kind == "dots" else (11.0, 4.6)
     figure = new_figure(*chapter_5_drawings.SIZES.get(kind, size))
     DRAWINGS[kind](result, figure)
-    legend = LEGENDS.get(kind, "")
+    printed = any(value is not None for row in table.rows for value in row.printed or ())
+    legend = LEGENDS.get(kind, "") if printed or kind == "scatter" else OURS_ALONE.get(kind, "")
     figure.suptitle(f"{table.heading}: {table.title}" + (f"\n{legend}" if legend else ""), fontsize=9)
     temporary = path.with_name(f".writing-{path.name}")
     figure.savefig(temporary, dpi=90, format="png", metadata={"Software": None})

@@ -128,7 +128,9 @@ def margin(
     if draws[0] and len(draws[0]) == len(draws[1]):
         paired = sign * (np.asarray(draws[0], np.float64) - np.asarray(draws[1], np.float64))
         low, high = np.percentile(paired, [50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE)])
-        return Estimate(differences[0], float("nan"), float(low), float(high), ONE_TRAINING)
+        recipe = table.row(better).recipe
+        how = "exact" if recipe is not None and recipe.kind == "analysis" else ONE_TRAINING
+        return Estimate(differences[0], float("nan"), float(low), float(high), how)
     if len(frames[0]) == len(frames[1]):
         low, high = over_frames(sign * (frames[0] - frames[1]))
     return Estimate(differences[0], float("nan"), low, high, "paired bootstrap over frames")

@@ -74,8 +74,10 @@ def status(row: Row, result: TableResult) -> str:
 def markdown(order: Order, result: TableResult) -> str:
     """The table with both numbers, the claims, the misprints."""
     table = result.table
-    lines = [f"# {table.heading}: {table.title}", "", f"Purpose: {table.purpose}.", ""]
-    lines += [f"- {line}" for line in describe(order, result)]
+    purpose = table.purpose if table.purpose.endswith("?") else f"{table.purpose}."
+    *made_from, command_line = describe(order, result)
+    lines = [f"# {table.heading}: {table.title}", "", f"Purpose: {purpose}", "", *(f"- {line}" for line in made_from)]
+    lines.append("- {} `{}`".format(*command_line.split(" ", 1)))
     if any(row.printed for row in table.rows):
         lines.append(f"- {WARNING}")
     lines += [f"- {note[0].upper()}{note[1:]}." for note in table.notes]
@@ -170,13 +172,14 @@ def write_outputs(order: Order, result: TableResult, folder: Path) -> list[Path]
     from pipeline.experiments.figures import draw
 
     stem = folder / result.table.name
-    texts = {".md": markdown(order, result), ".tex": latex(order, result), ".csv": csv_text(result)}
+    figure = draw(result, stem.with_name(stem.name + ".png"))
+    shown = f"\n![{result.table.heading}: {result.table.title}]({stem.name}.png)\n" if figure else ""
+    texts = {".md": markdown(order, result) + shown, ".tex": latex(order, result), ".csv": csv_text(result)}
     written = []
     for suffix, text in texts.items():
         path = stem.with_name(stem.name + suffix)
         write_text(path, text)
         written.append(path)
-    figure = draw(result, stem.with_name(stem.name + ".png"))
     return [*written, *([figure] if figure else [])]
 
 

@@ -5,6 +5,7 @@ Fonts are embedded (TrueType in PDF, outlines in SVG); colours are told apart wi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -80,19 +81,19 @@ class Material:
 
 
 def write_figures(
-    config: Config, run: RunFolder, dataset: Dataset, frames: Sequence[str], judged: Judged
+    config: Config, run: RunFolder, dataset: Dataset, frames: Sequence[str], judged: Judged, least: float = -math.inf
 ) -> list[Path]:
     """Writes report/figures/*.png|pdf|svg (`report.format`) and returns their paths.
 
     The frame shown is the one with the most labelled objects among the first `report.frames`; a figure whose data the
-    run does not have (no detections, no true depth) is left out.
+    run does not have (no detections, no true depth) is left out. Detections are drawn from score `least` on.
     """
     import matplotlib
 
     folder = run.report.parent / "figures"
     written = []
     with matplotlib.rc_context(STYLE):
-        for name, draw in _drawings(run, dataset, frames[: config.report.frames], judged):
+        for name, draw in _drawings(run, dataset, frames[: config.report.frames], judged, least):
             figure = draw()
             path = folder / f"{name}.{config.report.format}"
             write_bytes(path, saved(figure, config.report.format))
@@ -111,7 +112,7 @@ def saved(figure: Figure, kind: str) -> bytes:
 
 
 def _drawings(
-    run: RunFolder, dataset: Dataset, frames: Sequence[str], judged: Judged
+    run: RunFolder, dataset: Dataset, frames: Sequence[str], judged: Judged, least: float
 ) -> list[tuple[str, Callable[[], Figure]]]:
     """(file name, function that draws) of every figure this run has data for."""
     drawings: list[tuple[str, Callable[[], Figure]]] = []
@@ -126,7 +127,7 @@ def _drawings(
     if material.frame.has("target_depth"):
         drawings.append(("noise", lambda: noise(material)))
     if material.detections is not None:
-        drawings.append(("detections", lambda: detections(material)))
+        drawings.append(("detections", lambda: detections(material, least)))
     return drawings
 
 
@@ -216,20 +217,21 @@ def noise(material: Material) -> Figure:
     return panels.noise_rows(material.frame, material.completed, material.detections or [], WIDTH)
 
 
-def detections(material: Material) -> Figure:
-    """As Fig. 5.8: the image with boxes, and the cloud from above with true and predicted boxes."""
+def detections(material: Material, least: float) -> Figure:
+    """As Fig. 5.8: the image with boxes, and the cloud from above with true boxes and those of score `least` on."""
     frame = material.frame
     cloud = (
         material.cloud if material.cloud is not None else np.column_stack([frame.points, np.zeros(len(frame.points))])
     )
     labels = frame.labels if frame.has("labels") else []
-    return panels.image_over_bev(frame, cloud, labels, material.detections or [], WIDTH)
+    found = [item for item in material.detections or [] if item.score is None or item.score >= least]
+    return panels.image_over_bev(frame, cloud, labels, found, WIDTH)
 
 
 def precision_recall(judged: Judged) -> Figure:
     """3D and bird's-eye precision over recall of every class of which something was found."""
     targets = _found_targets(judged)
-    figure, axes = panels.grid(len(targets), min(3, len(targets)), WIDTH, 2.0)
+    figure, axes = panels.grid(len(targets), 2 if len(targets) in (2, 4) else min(3, len(targets)), WIDTH, 2.0)
     for axis, (target, curves) in zip(axes, targets):
         panels.curves(axis, {level: curve.precision() for level, curve in zip(LEVELS, curves)})
         axis.set_title(f"{target.cls}, {'3D' if target.metric == '3d' else 'bird’s eye'}, IoU {target.iou:g}")

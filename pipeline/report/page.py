@@ -83,19 +83,19 @@ def write_report(config: Config, run: RunFolder, dataset: Dataset, frames: tuple
         least=least,
     )
     write_text(run.report, render(run, page))
-    write_beside(config, run, dataset, frames, judged)
+    write_beside(config, run, dataset, frames, judged, least)
     return run.report
 
 
 def write_beside(
-    config: Config, run: RunFolder, dataset: Dataset, frames: tuple[str, ...], judged: Judged
+    config: Config, run: RunFolder, dataset: Dataset, frames: tuple[str, ...], judged: Judged, least: float
 ) -> list[Path]:
     """What `report.format` asks for beside the page: figures, or a recording of all frames for a viewer."""
     kind = config.report.format
     if kind in ("png", "pdf", "svg"):
         from pipeline.report.figures import write_figures
 
-        return write_figures(config, run, dataset, frames, judged)
+        return write_figures(config, run, dataset, frames, judged, least)
     if kind == "html":
         return []
     from pipeline.viewers.mcap_file import write_mcap

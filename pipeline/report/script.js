@@ -69,7 +69,11 @@
     if (event.key === "0") { if (AugCloud.least === -Infinity) toThreshold(); else slide(0); }
     if (event.key === "?") help();
   });
-  const help = () => byId("keys").showModal && byId("keys").showModal();
+  const help = () => {
+    const keys = byId("keys");
+    if (keys.open) keys.close();
+    else if (keys.showModal) keys.showModal();
+  };
   byId("help").addEventListener("click", help);
 
   // Values: pointing at one map of a frame reads all maps of that frame at the same place.

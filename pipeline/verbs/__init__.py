@@ -15,7 +15,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "check": ("pipeline.verbs.check", "find what is wrong with a data set"),
     "pack": ("pipeline.verbs.pack", "results as a benchmark submission"),
     "bench": ("pipeline.verbs.bench", "measure speed and accuracy on this machine"),
-    "env": ("pipeline.verbs.env", "versions, cores, memory, disk, GPU, extras and weights of this installation"),
+    "env": ("pipeline.verbs.env", "versions, cores, memory, disk, GPU, extras, weights of this machine"),
     "shell": ("pipeline.verbs.shell", "Tab completion for bash and zsh"),
 }
 

@@ -13,8 +13,16 @@ from pipeline.errors import UsageError
 COLUMNS = ("mae", "rmse", "tmae", "trmse", "mixed", "mixed_all", "edge_tmae", "missing", "seconds")
 
 
+EXAMPLES = """\
+example:
+  run_pipeline --stage bench --suite real --data KITTI --frames 0:11 \\
+      --rows 32,16
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
+    parser.epilog = EXAMPLES
     add = parser.add_argument
     add("--suite", choices=("real",), default="real", help="real: held-out LiDAR rings and cars on KITTI frames")
     add("--data", required=True, metavar="DIR", help="KITTI object folder (training/velodyne, image_2, calib, label_2)")

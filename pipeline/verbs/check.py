@@ -8,9 +8,18 @@ from pathlib import Path
 
 from pipeline.errors import UsageError
 
+EXAMPLES = """\
+examples:
+  run_pipeline --stage check KITTI
+  run_pipeline --stage check runs/kitti --data KITTI
+  run_pipeline --stage check DEPTH --format depth --data KITTI \\
+      --json report.json
+"""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
+    parser.epilog = EXAMPLES
     from pipeline.check.doctor import FORMATS
     from pipeline.check.leakage import BUILT_IN
     from pipeline.data import READERS
@@ -19,8 +28,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("path", nargs="?", type=Path, metavar="PATH", help="data set, run or exported folder to check")
     parser.add_argument("--data", type=Path, metavar="DIR", help="the data set PATH was made from; checked itself when "
                         "no PATH is given")  # fmt: skip
-    parser.add_argument("--dataset", choices=list(READERS), help="layout of --data (found out when not given)")
-    parser.add_argument("--format", choices=FORMATS, help="format of PATH (found out when not given)")
+    parser.add_argument("--dataset", choices=list(READERS), metavar="NAME", help="layout of --data (found out when not "
+                        f"given): {', '.join(READERS)}")  # fmt: skip
+    parser.add_argument("--format", choices=FORMATS, metavar="NAME", help="format of PATH (found out when not given): "
+                        f"{', '.join(FORMATS)}")  # fmt: skip
     parser.add_argument("--frames", metavar="FILE|a:b", help="split file, positions a:b or ids (all frames)")
     parser.add_argument("--workers", type=int, metavar="N", help="processes (all cores)")
     parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help="write the report as JSON (to the screen)")

@@ -18,15 +18,27 @@ if TYPE_CHECKING:
     from detection.evaluation.protocol import Range
 
 
+EXAMPLES = """\
+examples:
+  run_pipeline --stage evaluate --labels KITTI/training/label_2 \\
+      --detections runs/kitti/detections
+  ... --split KITTI/ImageSets/val.txt --classes Car --recall 40 --bootstrap 1000
+  ... --explain --json scores.json    why objects are missed; scores for scripts
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this verb."""
+    parser.epilog = EXAMPLES
     parser.add_argument("--labels", required=True, metavar="DIR", help="KITTI label files (label_2)")
     parser.add_argument("--detections", required=True, metavar="DIR", help="KITTI result files, one per frame")
     parser.add_argument("--split", metavar="FILE", help="names of the frames to evaluate (every labelled frame)")
-    parser.add_argument("--classes", default="Car,Pedestrian,Cyclist", metavar="Car,...")
-    parser.add_argument("--metrics", default="2d,aos,bev,3d", metavar="2d,...")
+    parser.add_argument("--classes", default="Car,Pedestrian,Cyclist", metavar="Car,...", help="all three")
+    parser.add_argument("--metrics", default="2d,aos,bev,3d", metavar="2d,...", help="2d, aos, bev and 3d")
     parser.add_argument("--recall", type=int, choices=(40, 11), default=40, help="recall points (40)")
-    parser.add_argument("--iou-set", choices=("strict", "loose", "both"), default="both")
+    parser.add_argument(
+        "--iou-set", choices=("strict", "loose", "both"), default="both", help="limits of BEV and 3D (both)"
+    )
     parser.add_argument(
         "--iou", action="append", default=[], metavar="CLASS=IOU", help="instead of the sets; may be repeated"
     )
@@ -63,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--explain", action="store_true", help="say why every object is matched, missed or ignored")
     parser.add_argument("--bootstrap", type=int, metavar="N", help="confidence intervals from N resamples of frames")
     parser.add_argument("--confidence", type=float, default=0.95, help="of the intervals (0.95)")
-    parser.add_argument("--bootstrap-seed", type=int, default=0)
+    parser.add_argument("--bootstrap-seed", type=int, default=0, metavar="N", help="of the resamples (0)")
     parser.add_argument(
         "--compare",
         action="append",

@@ -16,8 +16,17 @@ if TYPE_CHECKING:
 DEFAULT_OUT = "runs/experiments"
 
 
+EXAMPLES = """\
+examples:
+  run_pipeline --stage experiment --list
+  run_pipeline --stage experiment --table 4.5 4.6 --dry-run
+  run_pipeline --stage experiment --figure 2.5 3.3 4.3 --budget smoke --seeds 1
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
+    parser.epilog = EXAMPLES
     add = parser.add_argument
     add("--table", nargs="+", action="extend", default=[], metavar="N", help="tables of the thesis (--table 4.5 4.6)")
     add("--figure", nargs="+", action="extend", default=[], metavar="N", help="figures of the thesis (--figure 4.11)")

@@ -10,9 +10,20 @@ from pathlib import Path
 
 from pipeline.errors import UsageError
 
+EXAMPLES = """\
+examples:
+  run_pipeline --stage export --format virconv --data KITTI \\
+      --run runs/kitti --out exports/virconv
+  run_pipeline --stage export --format openpcdet --data KITTI \\
+      --run runs/kitti --out exports/openpcdet
+  run_pipeline --stage export --format sfd --virtual filtered --data KITTI \\
+      --run runs/kitti --out exports/sfd
+"""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
+    parser.epilog = EXAMPLES
     from pipeline.data import READERS
     from pipeline.export.formats import FORMATS
     from pipeline.export.record import VIRTUAL
@@ -27,7 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--data", type=Path, required=True, metavar="DIR", help="the data set that the run was made from"
     )
-    parser.add_argument("--dataset", default="kitti_object", choices=list(READERS), help="its layout (kitti_object)")
+    parser.add_argument("--dataset", default="kitti_object", choices=list(READERS), metavar="NAME", help="its layout "
+                        f"(kitti_object): {', '.join(READERS)}")  # fmt: skip
     parser.add_argument("--run", type=Path, metavar="DIR", help="run folder with depth/, cloud/, detections/")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="output folder")
     parser.add_argument("--frames", metavar="FILE|a:b", help="split file, positions a:b or ids (all frames)")

@@ -12,9 +12,17 @@ from typing import Any
 from detection.kitti_format import KittiObject
 from pipeline.errors import DataError, UsageError
 
+EXAMPLES = """\
+examples:
+  run_pipeline --stage import TWISE.tar --architecture twise \\
+      --out weights/twise.safetensors
+  run_pipeline --stage import result.pkl --architecture results --out detections
+"""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
+    parser.epilog = EXAMPLES
     parser.add_argument("path", type=Path, metavar="FILE", help="a checkpoint, or OpenPCDet's result.pkl")
     parser.add_argument(
         "--architecture",

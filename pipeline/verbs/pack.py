@@ -12,8 +12,16 @@ from detection.evaluation.submission import TEST_FRAMES, check_submission, write
 _SHOWN = 20
 
 
+EXAMPLES = """\
+example:
+  run_pipeline --stage pack --detections runs/test/detections \\
+      --archive submission.zip
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this verb."""
+    parser.epilog = EXAMPLES
     parser.add_argument("--detections", required=True, metavar="DIR", help="folder of result files 000000.txt ...")
     parser.add_argument("--archive", default="submission.zip", metavar="FILE", help="zip to write (submission.zip)")
     parser.add_argument(

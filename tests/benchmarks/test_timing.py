@@ -41,7 +41,7 @@ def test_table_holds_medians_spread_ratio_and_threads(tmp_path: Path) -> None:
     path = write_table([row, alone], tmp_path / "deep" / "table.md")
     text = path.read_text(encoding="utf-8")
     assert "| case | 2 ms [1-4] | peer | 5.5 ms [5-6] | 2.75 | agree | cpus 2 |" in text
-    assert "| alone | 1e+03 ms [1e+03-1e+03] | - |" in text
+    assert "| alone | 1,000 ms [1,000-1,000] | - |" in text
 
 
 def test_no_repeats_are_refused() -> None:

@@ -233,6 +233,17 @@ def test_a_disk_budget_stops_cleanly_and_the_run_continues(data: Path, tmp_path:
     assert len(done_frames(out, "augment")) == 4
 
 
+@pytest.mark.parametrize("change", ["augment.preset=LDF", "augment.presett=L"])
+def test_a_misspelt_preset_is_refused_before_anything_is_written(
+    change: str, data: Path, tmp_path: Path, capsys
+) -> None:
+    options = ["--config", "kitti", "--data", str(data), "--out", str(tmp_path / "run"), "--set", change]
+    for more in ([], ["--dry-run"]):
+        assert main([*options, *more]) == 2
+        assert "did you mean" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_dry_run_writes_nothing(data: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "run"
     command = [*AUGMENT, "--data", str(data), "--out", str(out), "--workers", "1"]

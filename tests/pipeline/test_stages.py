@@ -68,6 +68,15 @@ def test_preset_l_detects_in_raw_lidar_and_completes_nothing(data: Path, weights
     assert not (out / "cloud").exists()
 
 
+def test_back_to_raw_lidar_leaves_no_augmented_cloud(data: Path, weights: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    assert main(command(data, weights, out, "detect")) == 0
+    assert len(list((out / "cloud").glob("*.bin"))) == 3
+    assert main([*command(data, weights, out, "report"), "--set", "augment.preset=L"]) == 0
+    assert not list((out / "cloud").iterdir())
+    assert not json.loads((out / "metrics.json").read_text())["augmentation"]
+
+
 def test_a_frame_without_label_is_detected_listed_and_not_scored(weights: Path, tmp_path: Path, capsys) -> None:
     data = write_tiny_kitti(tmp_path / "kitti", 2)
     (data / "training" / "label_2" / "000001.txt").unlink()

@@ -14,7 +14,7 @@ from pipeline.errors import UsageError
 from pipeline.experiments import outputs
 from pipeline.experiments.catalogue import TABLES, find
 from pipeline.experiments.intervals import FAILS, HOLDS, PERHAPS, UNKNOWN, estimate, judge, kendall_tau, over_seeds
-from pipeline.experiments.plan import Order, TableResult
+from pipeline.experiments.plan import Order, TableResult, carry_out, gather, make_plan
 from pipeline.experiments.runs import Outcome
 from pipeline.experiments.tables import HIGHER, Claim, Column, RankClaim, Recipe, Row, Table
 
@@ -58,6 +58,14 @@ def test_orderings_are_judged_in_pairs_of_seeds() -> None:
     assert judge(table, outcomes(a=[1, 2, 3], b=[0.5, 3, 3], c=[9, 9, 9]))[0].verdict == PERHAPS
     assert judge(table, outcomes(a=[1, 2, 3], b=[2, 3, 4]))[0].verdict == UNKNOWN
     assert judge(small_table(claim, better=HIGHER), clear)[0].verdict == FAILS
+
+
+def test_an_exact_computation_decides_without_trainings(tmp_path: Path) -> None:
+    table = find("figure", "3.3")
+    order = Order((table,), tmp_path, "smoke", 1)
+    plan = make_plan(order)
+    carry_out(plan, say=lambda line: None)
+    assert [verdict.verdict for verdict in gather(plan, table).verdicts] == [HOLDS]
 
 
 def test_ranks_are_compared_by_kendalls_tau() -> None:
