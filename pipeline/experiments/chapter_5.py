@@ -28,9 +28,9 @@ REASONS = (
 NOTES = (
     "AP R40 of Car; IoU 0.7 as in the thesis, and IoU 0.5, in which the order of the rows is judged: detectors trained "
     "for so few steps place boxes too coarsely for 0.7",
-    "every row is trained with the same steps, frames and settings on its own kind of cloud; at budgets smoke and small "
-    "all rows of a detector begin with the same weights, trained on every kind of cloud in equal shares, so that seeds "
-    "vary what follows; the networks are the CPU sizes of `pipeline/experiments/detection_budget.py`",
+    "every row is trained with the same steps, frames and settings on its own kind of cloud; at budgets smoke and "
+    "small all rows of a detector begin with the same weights, trained on every kind of cloud in equal shares, so that "
+    "seeds vary what follows; the networks are the CPU sizes of `pipeline/experiments/detection_budget.py`",
     "intervals: over seeds (t) where there are several, else a bootstrap over the test frames, which does not hold "
     "the scatter between trainings",
 )
