@@ -182,7 +182,7 @@ def _judge_ranks(claim: RankClaim, table: Table, outcomes: Mapping[str, Sequence
     tau = kendall_tau(first.mean(1), second.mean(1))
     own = [kendall_tau(first[:, seed], second[:, seed]) for seed in range(first.shape[1])]
     evidence = f"Kendall's tau of the means {tau:.2f}; per seed {', '.join(f'{value:.2f}' for value in own)}"
-    alike = [value == 1 for value in (tau, *own)]
+    alike = [value > 1 - 1e-9 for value in (tau, *own)]  # equal ranks give 0.9999999999999999
     if all(alike) or not any(alike):
         return Verdict(claim.text, HOLDS if alike[0] == claim.same else FAILS, evidence)
     return Verdict(claim.text, PERHAPS, evidence)

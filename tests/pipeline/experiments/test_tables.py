@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +77,16 @@ def test_ranks_are_compared_by_kendalls_tau() -> None:
     verdicts = judge(small_table(same, other), outcomes(a=[1, 1], b=[2, 2], c=[5, 5], d=[7, 7]))
     assert [verdict.verdict for verdict in verdicts] == [HOLDS, FAILS]
     assert "1.00" in verdicts[0].evidence
+
+
+def test_five_methods_in_one_order_rank_alike() -> None:
+    # Five equal ranks give Kendall's tau 0.9999999999999999.
+    rows = tuple(Row(label, recipe=Recipe("analysis", {"what": label})) for label in "abcdefghij")
+    claim = RankClaim("alike", "x", tuple("abcde"), tuple("fghij"))
+    values = {label: [float(place % 5), 2.0 * (place % 5)] for place, label in enumerate("abcdefghij")}
+    verdict = judge(replace(small_table(), rows=rows, claims=(claim,)), outcomes(**values))[0]
+    assert verdict.verdict == HOLDS
+    assert verdict.evidence.endswith("1.00; per seed 1.00, 1.00")
 
 
 def test_latex_escapes_what_latex_reads_as_commands() -> None:
