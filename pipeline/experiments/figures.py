@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -89,7 +90,7 @@ def draw_curve(result: TableResult, figure: Any) -> None:
                 printed_axis.plot(*zip(*theirs), f"{marker}--", color=colours[name], alpha=0.5, markersize=4)
         ticks = [tick for tick, _ in next(iter(series.values()))]
         axis.set_xticks(range(len(ticks)), ticks, fontsize=8)
-        axis.set_title(column.heading, fontsize=9)
+        axis.set_title(textwrap.fill(column.heading, 20), fontsize=9)
         axis.tick_params(axis="y", labelsize=7)
         if printed_axis is not None:
             printed_axis.tick_params(axis="y", labelsize=7, colors="dimgrey")
