@@ -32,6 +32,7 @@ from detection.types import PointFrame
 LIMIT = 1.15
 REASONS = {
     "rotated NMS": "every box is compared with those kept before it, which grow with the boxes: at most quadratic",
+    "three nearest": "linear in the points; queries and results leave the caches (half as much again per point)",
     "furthest points": "4096 of N; blocks that a new sample cannot change are skipped",
 }
 
