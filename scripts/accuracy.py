@@ -6,6 +6,7 @@ cards of the embedded detectors (held-out synthetic frames). Run it whenever one
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 import sys
@@ -23,6 +24,7 @@ PLACE = re.compile(r"(<!-- accuracy[^>]*-->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def main() -> int:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     text = "\n".join(table(json.loads((ROOT / "docs" / "results" / "real.json").read_text())))
     for name in PAGES:
         page = ROOT / name
