@@ -33,15 +33,15 @@ class _Pair:
     def __init__(self, block: nn.Sequential, kernels: SharedRows, name: str) -> None:
         first, second = (layer for layer in block if not isinstance(layer, nn.ReLU))
         self.kernels, self.name, self.channels = kernels, name, int(first.out_channels)  # type: ignore[arg-type]
-        self.first, self.first_bias = _prepared(first), _bias(first)
-        self.second, self.second_bias = _prepared(second), _bias(second)
+        self.first, self.first_bias = _prepared(first), winograd.bias_of(first)
+        self.second, self.second_bias = _prepared(second), winograd.bias_of(second)
 
     def stem(self, planes: Float, coarse: Float | None) -> Float:
         """Planes (K, H, W) -> (H, W, C), plus a coarser map upsampled."""
         out = self.kernels.map(self.name, *planes.shape[1:], self.channels)
         above = (out, NOTHING) if coarse is None else (coarse, COARSER)
         weights = self.first, self.first_bias, self.second, self.second_bias
-        self.kernels.run(winograd.convolve_stem, -(-len(out) // 4), planes, *weights, *above, out)
+        self.kernels.run(winograd.convolve_stem, winograd.tile_rows(out), planes, *weights, *above, out)
         return out
 
     def halving(self, x: Float, coarse: Float | None = None) -> Float:
@@ -62,7 +62,7 @@ class _Pair:
         height, width, _ = summands[0].shape
         hidden = self._hidden(height, width)
         weights = self.first, self.first_bias
-        rows = -(-height // 4)
+        rows = winograd.tile_rows(hidden)
         self.kernels.run(winograd.convolve, rows, *_three(summands), RECTIFIED, *weights, hidden, NOTHING, hidden)
         out = np.empty((len(self.second_bias), height, width), np.float32)
         self.kernels.run(winograd.convolve_head, height, hidden, self.second, self.second_bias, out)
@@ -72,7 +72,9 @@ class _Pair:
         out = self.kernels.map(name, *summands[0].shape[:2], self.channels)
         above = (out, NOTHING) if coarse is None else (coarse, COARSER)
         weights = self.second, self.second_bias
-        self.kernels.run(winograd.convolve, -(-len(out) // 4), *_three(summands), RECTIFIED, *weights, *above, out)
+        self.kernels.run(
+            winograd.convolve, winograd.tile_rows(out), *_three(summands), RECTIFIED, *weights, *above, out
+        )
         return out
 
     def _hidden(self, height: int, width: int) -> Float:
@@ -88,11 +90,6 @@ def _three(summands: Features) -> tuple[Float, Float, Float, int]:
     """Maps for a kernel that adds one to three."""
     padded = (*summands, summands[0], summands[0])
     return padded[0], padded[1], padded[2], len(summands)
-
-
-def _bias(layer: Any) -> Float:
-    bias: Float = layer.bias.detach().numpy()
-    return bias
 
 
 def _prepared(layer: Any) -> Float:

@@ -32,8 +32,8 @@ class PixelUNetKernels:
         self.lock = threading.Lock()
         self.stem = _winograd(network.stem)
         self.encoder = [[_residual(one) for one in stage.children()] for stage in network.encoder]
-        self.down = [(winograd.quarter_weights(one.weight), _bias(one)) for one in network.down]  # type: ignore[arg-type]
-        self.up = [(_array(one.weight[:, :, 0, 0].T), _bias(one)) for one in network.up]  # type: ignore[index]
+        self.down = [(winograd.quarter_weights(one.weight), winograd.bias_of(one)) for one in network.down]  # type: ignore[arg-type]
+        self.up = [(_array(one.weight[:, :, 0, 0].T), winograd.bias_of(one)) for one in network.up]  # type: ignore[index]
         self.decoder = [_residual(one) for one in network.decoder]
         self.head = _head(network.head.weight[:, :, 0, 0]), _head(_tensor(network.head.bias))
 
@@ -68,7 +68,7 @@ class PixelUNetKernels:
         weights, bias = layer
         out = self.rows.map(name, *x.shape[:2], len(bias))
         other = (out, NOTHING) if added is None else (added, SAME)
-        self.rows.run(winograd.convolve, -(-len(out) // 4), x, x, x, 1, least, weights, bias, *other, out)
+        self.rows.run(winograd.convolve, winograd.tile_rows(out), x, x, x, 1, least, weights, bias, *other, out)
         return out
 
     def _quarter(self, name: str, x: Float, layer: Any) -> Float:
@@ -93,12 +93,8 @@ def _array(x: Tensor) -> Float:
     return np.asarray(x.detach().contiguous().numpy())
 
 
-def _bias(layer: Any) -> Float:
-    return _array(layer.bias)
-
-
 def _winograd(layer: nn.Conv2d) -> tuple[Float, Float]:
-    return winograd.winograd_weights(layer.weight), _bias(layer)
+    return winograd.winograd_weights(layer.weight), winograd.bias_of(layer)
 
 
 def _residual(block: nn.Module) -> tuple[tuple[Float, Float], tuple[Float, Float]]:

@@ -14,6 +14,7 @@ interpreter and write every pixel of it, so that rows can be shared among thread
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -30,7 +31,7 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 RECTIFIED, LINEAR = np.float32(0), np.float32(-np.inf)
 # What a convolution adds to its result: nothing, a map of its size, a coarser one (bilinear with aligned corners).
 NOTHING, SAME, COARSER = 0, 1, 2
-# Pixels of a block of `halve`, `double` and `convolve_head`. These and the tiles of `_tiles` keep a block in the
+# Pixels of a block of `halve`, `double` and `convolve_head`. These and the tiles of `_blocks` keep a block in the
 # second-level cache, and its products below the size for which BLAS libraries start threads of their own.
 PIXELS = 32
 
@@ -202,18 +203,17 @@ def _finish(patch, weights, bias, row, start, count, other, kind, work, out):  #
 
 
 @njit(inline="always")
-def _tiles(channels):  # type: ignore[no-untyped-def]
-    """Tiles of a block: 16 for 64 channels."""
-    return max(8, 1024 // channels)
-
-
-@njit(inline="always")
-def _workspace(tiles, inputs, outputs):  # type: ignore[no-untyped-def]
-    return (
+def _blocks(weights, width):  # type: ignore[no-untyped-def]
+    """Tiles of a block (16 for 64 channels), tiles across a map, a block's patch, and memory for `_finish`."""
+    inputs, outputs = weights.shape[1:]
+    tiles = max(8, 1024 // max(inputs, outputs))
+    patch = np.empty((6, 4 * tiles + 2, inputs), np.float32)
+    work = (
         np.empty((36, tiles, inputs), np.float32),
         np.empty((36, tiles, outputs), np.float32),
         np.empty((4, outputs), np.float32),
     )
+    return tiles, (width + 3) // 4, patch, work
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -225,10 +225,7 @@ def convolve(first, last, x, y, z, summands, least, weights, bias, other, kind, 
     least      RECTIFIED or LINEAR
     other      (H, W, O) or (h, w, O), as `kind` says: NOTHING, SAME or COARSER
     """
-    inputs, outputs = weights.shape[1:]
-    tiles, across = _tiles(max(inputs, outputs)), (out.shape[1] + 3) // 4
-    patch = np.empty((6, 4 * tiles + 2, inputs), np.float32)
-    work = _workspace(tiles, inputs, outputs)
+    tiles, across, patch, work = _blocks(weights, out.shape[1])
     for row in range(first, last):
         for start in range(0, across, tiles):
             count = min(tiles, across - start)
@@ -239,15 +236,22 @@ def convolve(first, last, x, y, z, summands, least, weights, bias, other, kind, 
 @njit(cache=True, nogil=True, error_model="numpy")
 def convolve_stem(first, last, planes, stem, stem_bias, weights, bias, other, kind, out):  # type: ignore[no-untyped-def]
     """`convolve` of the rectified convolution of planes (K, H, W) by stem (K, 3, 3, I) and its bias."""
-    inputs, outputs = weights.shape[1:]
-    tiles, across = _tiles(max(inputs, outputs)), (out.shape[1] + 3) // 4
-    patch = np.empty((6, 4 * tiles + 2, inputs), np.float32)
-    work = _workspace(tiles, inputs, outputs)
+    tiles, across, patch, work = _blocks(weights, out.shape[1])
     for row in range(first, last):
         for start in range(0, across, tiles):
             count = min(tiles, across - start)
             _stem(planes, stem, stem_bias, 4 * row - 1, 4 * start - 1, 6, 4 * count + 2, patch)
             _finish(patch, weights, bias, row, start, count, other, kind, work, out)
+
+
+def tile_rows(out: Float) -> int:
+    """Rows of tiles of a map: `last` of `convolve` and `convolve_stem` for all of it."""
+    return (len(out) + 3) // 4
+
+
+def bias_of(layer: Any) -> Float:
+    """The bias (O,) of a convolution."""
+    return np.asarray(layer.bias.detach().contiguous().numpy())
 
 
 def tap_weights(weight: Tensor, transposed: bool = False) -> Float:

@@ -73,6 +73,11 @@ TRAIN_IDS = {
 PARTLY_OCCLUDED, LARGELY_OCCLUDED = 0.1, 0.6
 
 
+def looks_like_vkitti2(root: Path) -> bool:
+    """Whether a folder holds a scene, or an archive unpacked into its own folder."""
+    return any(any(root.glob(sign)) for sign in ("Scene[0-9][0-9]", "vkitti_2.0.3_*"))
+
+
 def open_vkitti2(root: str | Path) -> Dataset:
     """Every frame under `root`, all variations and cameras found, in the order of scene, variation, camera, frame.
 

@@ -104,15 +104,16 @@ def identity(data: Path | None, budget: CompletionBudget) -> dict[str, Any]:
 def open_any(root: Path) -> Dataset:
     """The data set in a folder, recognised by its folders. UsageError when it is none that has true depth."""
     from pipeline.data import open_dataset
+    from pipeline.data.vkitti2 import looks_like_vkitti2
 
     signs = (
         ("kitti_depth", "data_depth_annotated"),
         ("kitti_object", "training/depth_2"),
-        ("vkitti2", "Scene[0-9][0-9]"),
-        ("vkitti2", "vkitti_2.0.3_*"),
         ("nyuv2", "*.mat"),
         ("nyuv2", "**/*.h5"),
     )
+    if looks_like_vkitti2(root):
+        return open_dataset("vkitti2", root)
     for name, sign in signs:
         if any(root.glob(sign)):
             return open_dataset(name, root)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -127,9 +126,10 @@ def gather(plan: Plan, table: Table) -> TableResult:
     """The results of a table: of every row the seeds that are finished, up to the first that is not."""
     outcomes: dict[str, list[Outcome]] = {}
     for label, runs in plan.runs[table.name].items():
-        found = (read_result(run, plan.order.out) for run in runs)
-        done = [outcome for outcome in takewhile(lambda outcome: outcome is not None, found) if outcome is not None]
-        if done:
-            outcomes[label] = done
+        for run in runs:
+            outcome = read_result(run, plan.order.out)
+            if outcome is None:
+                break
+            outcomes.setdefault(label, []).append(outcome)
     folders = {label: [run.folder(plan.order.out) for run in runs] for label, runs in plan.runs[table.name].items()}
     return TableResult(table, outcomes, judge(table, outcomes), folders)

@@ -84,9 +84,9 @@ def world_identity(data: Path | None, train_frames: int, test_frames: int, size:
 
 def _splits(data: Path) -> tuple[str, Dataset, Dataset]:
     """Reader, training and test frames of a Virtual KITTI 2 or KITTI object folder."""
-    from pipeline.data.vkitti2 import thesis_split
+    from pipeline.data.vkitti2 import looks_like_vkitti2, thesis_split
 
-    if any(data.glob("Scene*")) or any(data.glob("vkitti_2.0.3_*")):
+    if looks_like_vkitti2(data):
         whole = open_dataset("vkitti2", data)
         return "vkitti2", thesis_split(whole, "train"), thesis_split(whole, "test")
     whole = open_dataset("kitti_object", data)
