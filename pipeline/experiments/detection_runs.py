@@ -71,7 +71,7 @@ def cost(recipe: Recipe, budget: DetectionBudget) -> Cost:
     seconds = budget.steps * choice.seconds_per_step * budget.batch / 2 + budget.test_frames * choice.seconds_per_frame
     # Clouds are shared by seeds and detectors: a table has some six kinds of them.
     clouds = (5 * _MEGABYTE + 6 * 26.0 * budget.cloud_points) * frames
-    start = {choice.preset: budget.start_steps * choice.seconds_per_step * budget.batch / 2}
+    start = {choice.preset: choice.start_steps * choice.seconds_per_step * budget.batch / 2}
     return Cost(seconds + 0.15 * frames, 5 * _MEGABYTE, budget.seconds_per_data_frame * frames, clouds, start)
 
 
@@ -147,15 +147,17 @@ def train_settings(recipe: DetectionRecipe, context: Context) -> TrainSettings:
 def train_detector(recipe: DetectionRecipe, frames: Dataset, context: Context) -> Path:
     """Weights for a recipe; runs that differ only in their test clouds share them."""
     clouds = clouds_of(frames, recipe.train_input, context)
-    start = common_start(recipe.detector, frames, context) if context.budget.start_steps else None
+    begun = detector_choice(recipe, context.budget).start_steps > 0
+    start = common_start(recipe.detector, frames, context) if begun else None
     return _trained(train_settings(recipe, context), clouds, [clouds.folder.name], start, context)
 
 
 def common_start(detector: str, frames: Dataset, context: Context) -> Path:
     """Weights that every row with this detector begins with, whatever its seed and input; trained once."""
     sources = [clouds_of(frames, kind, context) for kind in start_inputs(frames[0])]
-    settings = train_settings(DetectionRecipe(detector, InputRecipe(), InputRecipe()), context)
-    settings = replace(settings, steps=context.budget.start_steps, seed=0)
+    recipe = DetectionRecipe(detector, InputRecipe(), InputRecipe())
+    steps = detector_choice(recipe, context.budget).start_steps
+    settings = replace(train_settings(recipe, context), steps=steps, seed=0)
     return _trained(settings, Mixture(sources), [source.folder.name for source in sources], None, context)
 
 
