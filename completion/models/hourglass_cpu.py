@@ -99,8 +99,7 @@ def _prepared(layer: Any) -> Float:
     if layer.stride[0] == 2:
         return winograd.tap_weights(layer.weight)
     if layer.in_channels <= 3:
-        stem: Float = layer.weight.detach().permute(1, 2, 3, 0).contiguous().numpy()
-        return stem
+        return winograd.stem_weights(layer.weight)
     return winograd.head_weights(layer.weight) if layer.out_channels <= 3 else winograd.winograd_weights(layer.weight)
 
 

@@ -14,6 +14,7 @@ from torch.nn import functional as F
 from completion.models import winograd
 from completion.models.selection import CANDIDATES, PixelUNet, Residual
 from completion.models.shared_rows import SharedRows
+from completion.models.small_product import with_whole_lanes
 from completion.models.winograd import LINEAR, NOTHING, RECTIFIED, SAME
 
 Float = NDArray[np.float32]
@@ -33,7 +34,7 @@ class PixelUNetKernels:
         self.stem = _winograd(network.stem)
         self.encoder = [[_residual(one) for one in stage.children()] for stage in network.encoder]
         self.down = [(winograd.quarter_weights(one.weight), winograd.bias_of(one)) for one in network.down]  # type: ignore[arg-type]
-        self.up = [(_array(one.weight[:, :, 0, 0].T), winograd.bias_of(one)) for one in network.up]  # type: ignore[index]
+        self.up = [(with_whole_lanes(_array(one.weight[:, :, 0, 0].T)), winograd.bias_of(one)) for one in network.up]  # type: ignore[index]
         self.decoder = [_residual(one) for one in network.decoder]
         self.head = _head(network.head.weight[:, :, 0, 0]), _head(_tensor(network.head.bias))
 

@@ -23,6 +23,7 @@ from completion.mixture import surface_shares
 from completion.models.pixel_unet_cpu import PixelUNetKernels
 from completion.models.rings import interpolate_rows, sweep
 from completion.models.selection import CANDIDATES, CHANNELS, COLUMN_SHIFTS, INPUTS, Selection
+from completion.models.small_product import multiply
 from completion.twin_surface import fuse
 
 Float = NDArray[np.float32]
@@ -132,24 +133,23 @@ def _softmax(weights, top):  # type: ignore[no-untyped-def]
     for k in range(CANDIDATES):
         for i in range(_RUN):
             top[i] += weights[k, i]
+    for i in range(_RUN):
+        top[i] = _ONE / top[i]
     for k in range(CANDIDATES):
         for i in range(_RUN):
-            weights[k, i] /= top[i]
+            weights[k, i] *= top[i]
 
 
 @njit(inline="always")
 def _cumulate(weights, depths, cumulated):  # type: ignore[no-untyped-def]
     """cumulated[k]: the weight of all candidates not behind candidate k. Comparing all pairs needs no branch, unlike
-    sorting."""
+    sorting; twice as many comparisons as needed, but only one sum is written, at the end."""
     for k in range(CANDIDATES):
         for i in range(_RUN):
-            cumulated[k, i] = weights[k, i]
-    for k in range(1, CANDIDATES):
-        for j in range(k):
-            for i in range(_RUN):
-                behind = depths[j, i] <= depths[k, i]
-                cumulated[k, i] += weights[j, i] if behind else _ZERO
-                cumulated[j, i] += _ZERO if behind else weights[k, i]
+            total = _ZERO
+            for j in range(CANDIDATES):
+                total += weights[j, i] if depths[j, i] <= depths[k, i] else _ZERO
+            cumulated[k, i] = total
 
 
 @njit(inline="always")
@@ -230,7 +230,7 @@ def _read_features(first, last, features, kernels, bias, logs, top, shifts, resi
             for i in range(count):
                 for c in range(features.shape[2]):
                     rectified[i, c] = max(features[source, start // 2 + i, c], _ZERO)
-            np.dot(rectified[:count], kernels[side], head[:count])
+            multiply(rectified[:count], kernels[side], head[:count])
             for k in range(CANDIDATES):
                 for c in range(2):
                     a, b = 2 * k + c, 2 * (CANDIDATES + k) + c

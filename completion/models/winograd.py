@@ -21,6 +21,8 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
+from completion.models.small_product import ROWS, multiply, with_whole_lanes
+
 Float = NDArray[np.float32]
 _A, _B = math.sqrt(0.5), math.sqrt(2)
 _POINTS = (0.0, _A, -_A, _B, -_B)
@@ -31,13 +33,15 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 RECTIFIED, LINEAR = np.float32(0), np.float32(-np.inf)
 # What a convolution adds to its result: nothing, a map of its size, a coarser one (bilinear with aligned corners).
 NOTHING, SAME, COARSER = 0, 1, 2
-# Pixels of a block of `halve`, `double` and `convolve_head`. These and the tiles of `_blocks` keep a block in the
-# second-level cache, and its products below the size for which BLAS libraries start threads of their own.
-PIXELS = 32
+# Pixels of a block of `halve`, `double` and `convolve_head`: few enough for a block to stay in the second-level cache.
+PIXELS = 8 * ROWS
 
 
 def winograd_weights(weight: Tensor) -> Float:
-    """Weights (O, I, 3, 3) -> (36, I, O) for `convolve`; computed in float64."""
+    """Weights (O, I, 3, 3) -> (36, I, O') for `convolve`, computed in float64.
+
+    O' is O with whole lanes (see `small_product`), here and in all weights below.
+    """
     rows = []
     for point in _POINTS:
         scale = math.prod(point - other for other in _POINTS if other != point)
@@ -45,7 +49,7 @@ def winograd_weights(weight: Tensor) -> Float:
     rows.append([0.0, 0.0, 1.0])
     transform = np.array(rows)
     both = np.einsum("ia,jb,ocab->ijco", transform, transform, weight.detach().double().numpy())
-    return np.ascontiguousarray(both.reshape(36, *both.shape[2:]).astype(np.float32))
+    return with_whole_lanes(both.reshape(36, *both.shape[2:]).astype(np.float32))
 
 
 @njit(inline="always")
@@ -93,30 +97,33 @@ def _gather(x, y, z, summands, least, top, left, rows, columns, step, patch):  #
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _stem(planes, weights, bias, top, left, rows, columns, patch):  # type: ignore[no-untyped-def]
-    """patch (rows, columns, C): rectified convolution of planes (K, H, W) by weights (K, 3, 3, C), zeros outside."""
+def _stem(planes, weights, bias, top, left, work, patch):  # type: ignore[no-untyped-def]
+    """patch (6, columns, C) from (top, left): rectified convolution of planes (K, H, W) by weights (9 K, C'), zeros
+    outside."""
+    strip, taps, m = work
     kinds, height, width = planes.shape
-    channels = len(bias)
+    rows, columns, channels = patch.shape
+    for k in range(kinds):
+        for i in range(rows + 2):
+            r = top + i - 1
+            for j in range(columns + 2):
+                q = left + j - 1
+                strip[k, i, j] = planes[k, r, q] if 0 <= r < height and 0 <= q < width else _ZERO
     for i in range(rows):
-        r = top + i
+        if top + i < 0 or top + i >= height:
+            patch[i] = _ZERO
+            continue
         for j in range(columns):
-            q = left + j
-            out = patch[i, j]
-            if r < 0 or r >= height or q < 0 or q >= width:
-                for c in range(channels):
-                    out[c] = _ZERO
-                continue
-            for c in range(channels):
-                out[c] = bias[c]
             for k in range(kinds):
-                for dy in range(max(0, 1 - r), min(3, height + 1 - r)):
-                    for dx in range(max(0, 1 - q), min(3, width + 1 - q)):
-                        value = planes[k, r + dy - 1, q + dx - 1]
-                        if value != _ZERO:  # most pixels of a sparse map are
-                            for c in range(channels):
-                                out[c] += value * weights[k, dy, dx, c]
+                for dy in range(3):
+                    for dx in range(3):
+                        taps[j, 9 * k + 3 * dy + dx] = strip[k, i + dy, j + dx]
+        multiply(taps, weights, m)
+        for j in range(columns):
+            inside = 0 <= left + j < width
             for c in range(channels):
-                out[c] = out[c] if out[c] > _ZERO else _ZERO
+                value = m[j, c] + bias[c]
+                patch[i, j, c] = value if inside and value > _ZERO else _ZERO
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
@@ -139,7 +146,7 @@ def _transform(patch, count, v):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _transform_columns_back(m, count):  # type: ignore[no-untyped-def]
-    """m (36, count, C): the first half of the transform of outputs, in place; its first 24 maps are left."""
+    """m (36, count, O'): the first half of the transform of outputs, in place; its first 24 maps are left."""
     flat = m.reshape(36, -1)
     for j in range(6):
         for i in range(count * m.shape[2]):
@@ -151,7 +158,7 @@ def _transform_columns_back(m, count):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _transform_row_back(m, t, bias, pixels):  # type: ignore[no-untyped-def]
-    """The other half: m (6, count, C) at tile t, plus bias (C,) -> pixels (4, C)."""
+    """The other half: m (6, count, O') at tile t, plus bias (O,) -> pixels (4, O)."""
     for c in range(len(bias)):
         r = _interpolated(m[0, t, c], m[1, t, c], m[2, t, c], m[3, t, c], m[4, t, c], m[5, t, c])
         pixels[0, c], pixels[1, c], pixels[2, c], pixels[3, c] = (
@@ -183,7 +190,7 @@ def _finish(patch, weights, bias, row, start, count, other, kind, work, out):  #
     height, width, channels = out.shape
     _transform(patch, count, v)
     for p in range(36):
-        np.dot(v[p, :count], weights[p], m[p, :count])
+        multiply(v[p, :count], weights[p], m[p, :count])
     _transform_columns_back(m, count)
     for i in range(min(4, height - 4 * row)):
         y = 4 * row + i
@@ -203,17 +210,17 @@ def _finish(patch, weights, bias, row, start, count, other, kind, work, out):  #
 
 
 @njit(inline="always")
-def _blocks(weights, width):  # type: ignore[no-untyped-def]
-    """Tiles of a block (16 for 64 channels), tiles across a map, a block's patch, and memory for `_finish`."""
+def _blocks(weights, out):  # type: ignore[no-untyped-def]
+    """Tiles of a block (18 for 64 channels), tiles across `out`, a block's patch, and memory for `_finish`."""
     inputs, outputs = weights.shape[1:]
-    tiles = max(8, 1024 // max(inputs, outputs))
+    tiles = ROWS * max(1, 192 // max(inputs, outputs))
     patch = np.empty((6, 4 * tiles + 2, inputs), np.float32)
     work = (
         np.empty((36, tiles, inputs), np.float32),
         np.empty((36, tiles, outputs), np.float32),
-        np.empty((4, outputs), np.float32),
+        np.empty((4, out.shape[2]), np.float32),
     )
-    return tiles, (width + 3) // 4, patch, work
+    return tiles, (out.shape[1] + 3) // 4, patch, work
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -221,11 +228,11 @@ def convolve(first, last, x, y, z, summands, least, weights, bias, other, kind, 
     """Rows of tiles first..last of out (H, W, O): x + y + z, cut at `least`, convolved, plus bias, plus another map.
 
     x, y, z    (H, W, I), of which the first `summands` count
-    weights    (36, I, O), see `winograd_weights`
+    weights    (36, I, O'), see `winograd_weights`
     least      RECTIFIED or LINEAR
     other      (H, W, O) or (h, w, O), as `kind` says: NOTHING, SAME or COARSER
     """
-    tiles, across, patch, work = _blocks(weights, out.shape[1])
+    tiles, across, patch, work = _blocks(weights, out)
     for row in range(first, last):
         for start in range(0, across, tiles):
             count = min(tiles, across - start)
@@ -235,12 +242,18 @@ def convolve(first, last, x, y, z, summands, least, weights, bias, other, kind, 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def convolve_stem(first, last, planes, stem, stem_bias, weights, bias, other, kind, out):  # type: ignore[no-untyped-def]
-    """`convolve` of the rectified convolution of planes (K, H, W) by stem (K, 3, 3, I) and its bias."""
-    tiles, across, patch, work = _blocks(weights, out.shape[1])
+    """`convolve` of the rectified convolution of planes (K, H, W) by stem (9 K, I', see `stem_weights`) and its bias."""
+    tiles, across, patch, work = _blocks(weights, out)
+    kinds, columns = len(planes), patch.shape[1]
+    stem_work = (
+        np.empty((kinds, 8, columns + 2), np.float32),
+        np.empty((columns, len(stem)), np.float32),
+        np.empty((columns, stem.shape[1]), np.float32),
+    )
     for row in range(first, last):
         for start in range(0, across, tiles):
             count = min(tiles, across - start)
-            _stem(planes, stem, stem_bias, 4 * row - 1, 4 * start - 1, 6, 4 * count + 2, patch)
+            _stem(planes, stem, stem_bias, 4 * row - 1, 4 * start - 1, stem_work, patch)
             _finish(patch, weights, bias, row, start, count, other, kind, work, out)
 
 
@@ -255,29 +268,28 @@ def bias_of(layer: Any) -> Float:
 
 
 def tap_weights(weight: Tensor, transposed: bool = False) -> Float:
-    """Weights (O, I, 3, 3), or (I, O, 3, 3) when transposed -> (9, I, O) for `halve` and `double`."""
+    """Weights (O, I, 3, 3), or (I, O, 3, 3) when transposed -> (9, I, O') for `halve` and `double`."""
     order = (2, 3, 0, 1) if transposed else (2, 3, 1, 0)
-    taps = weight.detach().permute(order).flatten(0, 1).contiguous().numpy()
-    return np.asarray(taps)
+    return with_whole_lanes(weight.detach().permute(order).flatten(0, 1).numpy())
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def halve(first, last, x, weights, bias, out):  # type: ignore[no-untyped-def]
     """Rows first..last of out (H/2, W/2, O): relu(x), (H, W, I), convolved with stride 2 and padding 1, plus bias."""
-    inputs, outputs = weights.shape[1:]
+    inputs, columns = weights.shape[1:]
     patch = np.empty((3, 2 * PIXELS + 1, inputs), np.float32)
-    m = np.empty((9, PIXELS, outputs), np.float32)
+    m = np.empty((9, PIXELS, columns), np.float32)
     width = out.shape[1]
     for row in range(first, last):
         for start in range(0, width, PIXELS):
             n = min(PIXELS, width - start)
             _gather(x, x, x, 1, RECTIFIED, 2 * row - 1, 2 * start - 1, 3, 2 * n + 1, 2, patch)
             for i in range(3):
-                np.dot(patch[i, :n], weights[3 * i], m[3 * i, :n])
-                np.dot(patch[i, n + 1 : 2 * n + 1], weights[3 * i + 1], m[3 * i + 1, :n])
-                np.dot(patch[i, 1 : n + 1], weights[3 * i + 2], m[3 * i + 2, :n])
+                multiply(patch[i, :n], weights[3 * i], m[3 * i, :n])
+                multiply(patch[i, n + 1 : 2 * n + 1], weights[3 * i + 1], m[3 * i + 1, :n])
+                multiply(patch[i, 1 : n + 1], weights[3 * i + 2], m[3 * i + 2, :n])
             for j in range(n):
-                for c in range(outputs):
+                for c in range(len(bias)):
                     upper = m[0, j, c] + m[1, j, c] + m[2, j, c]
                     middle = m[3, j, c] + m[4, j, c] + m[5, j, c]
                     lower = m[6, j, c] + m[7, j, c] + m[8, j, c]
@@ -288,9 +300,9 @@ def halve(first, last, x, weights, bias, out):  # type: ignore[no-untyped-def]
 def double(first, last, x, y, z, summands, weights, bias, out):  # type: ignore[no-untyped-def]
     """Rows first..last of x (H, W, I) -> two rows each of out (2H, 2W, O): relu(x + y + z) by a transposed convolution
     of stride 2 (padding and output padding 1), plus bias."""
-    inputs, outputs = weights.shape[1:]
+    inputs, columns = weights.shape[1:]
     patch = np.empty((2, PIXELS + 1, inputs), np.float32)
-    m = np.empty((9, PIXELS, outputs), np.float32)
+    m = np.empty((9, PIXELS, columns), np.float32)
     width = x.shape[1]
     for row in range(first, last):
         for start in range(0, width, PIXELS):
@@ -300,10 +312,10 @@ def double(first, last, x, y, z, summands, weights, bias, out):  # type: ignore[
                 source = patch[1 if i == 0 else 0]
                 for k in range(3):
                     shift = 1 if k == 0 else 0
-                    np.dot(source[shift : shift + n], weights[3 * i + k], m[3 * i + k, :n])
+                    multiply(source[shift : shift + n], weights[3 * i + k], m[3 * i + k, :n])
             for j in range(n):
                 left = 2 * (start + j)
-                for c in range(outputs):
+                for c in range(len(bias)):
                     out[2 * row, left, c] = bias[c] + m[4, j, c]
                     out[2 * row, left + 1, c] = bias[c] + (m[3, j, c] + m[5, j, c])
                     out[2 * row + 1, left, c] = bias[c] + (m[1, j, c] + m[7, j, c])
@@ -311,9 +323,14 @@ def double(first, last, x, y, z, summands, weights, bias, out):  # type: ignore[
                     out[2 * row + 1, left + 1, c] = bias[c] + corners
 
 
+def stem_weights(weight: Tensor) -> Float:
+    """Weights (O, K, 3, 3) of few inputs -> (9 K, O') for `convolve_stem`."""
+    return with_whole_lanes(weight.detach().permute(1, 2, 3, 0).flatten(0, 2).numpy())
+
+
 def quarter_weights(weight: Tensor) -> Float:
-    """Weights (O, I, 2, 2) -> (2, 2 I, O) for `quarter`."""
-    return np.asarray(weight.detach().permute(2, 3, 1, 0).flatten(1, 2).contiguous().numpy())
+    """Weights (O, I, 2, 2) -> (2, 2 I, O') for `quarter`."""
+    return with_whole_lanes(weight.detach().permute(2, 3, 1, 0).flatten(1, 2).numpy())
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
@@ -322,12 +339,12 @@ def quarter(first, last, pairs, weights, bias, out):  # type: ignore[no-untyped-
 
     pairs  (H/2, 2, W/2, 2 I), a view of x (H, W, I): the two pixels of a row that belong together lie together
     """
-    m = np.empty((2, PIXELS, len(bias)), np.float32)
+    m = np.empty((2, PIXELS, weights.shape[2]), np.float32)
     for row in range(first, last):
         for start in range(0, out.shape[1], PIXELS):
             n = min(PIXELS, out.shape[1] - start)
             for i in range(2):
-                np.dot(pairs[row, i, start : start + n], weights[i], m[i, :n])
+                multiply(pairs[row, i, start : start + n], weights[i], m[i, :n])
             for j in range(n):
                 for c in range(len(bias)):
                     out[row, start + j, c] = bias[c] + (m[0, j, c] + m[1, j, c])
@@ -335,13 +352,13 @@ def quarter(first, last, pairs, weights, bias, out):  # type: ignore[no-untyped-
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def lift(first, last, x, weights, bias, skip, out):  # type: ignore[no-untyped-def]
-    """Rows first..last of x (h, w, I) -> two rows each of out (2h, 2w, O): weights (I, O), bias, each pixel repeated
+    """Rows first..last of x (h, w, I) -> two rows each of out (2h, 2w, O): weights (I, O'), bias, each pixel repeated
     2x2, plus skip."""
-    m = np.empty((PIXELS, len(bias)), np.float32)
+    m = np.empty((PIXELS, weights.shape[1]), np.float32)
     for row in range(first, last):
         for start in range(0, x.shape[1], PIXELS):
             n = min(PIXELS, x.shape[1] - start)
-            np.dot(x[row, start : start + n], weights, m[:n])
+            multiply(x[row, start : start + n], weights, m[:n])
             for y in range(2 * row, 2 * row + 2):
                 for j in range(2 * n):
                     column = 2 * start + j
@@ -350,9 +367,8 @@ def lift(first, last, x, weights, bias, skip, out):  # type: ignore[no-untyped-d
 
 
 def head_weights(weight: Tensor) -> Float:
-    """Weights (O, I, 3, 3) of few outputs -> (I, 9 O) for `convolve_head`."""
-    flat = weight.detach().permute(1, 2, 3, 0).flatten(1).contiguous().numpy()
-    return np.asarray(flat)
+    """Weights (O, I, 3, 3) of few outputs -> (I, 9 O, with whole lanes) for `convolve_head`."""
+    return with_whole_lanes(weight.detach().permute(1, 2, 3, 0).flatten(1).numpy())
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
@@ -374,7 +390,7 @@ def convolve_head(first, last, x, weights, bias, out):  # type: ignore[no-untype
             for start in range(0, width, PIXELS):
                 n = min(PIXELS, width - start)
                 _gather(x, x, x, 1, RECTIFIED, row, start, 1, n, 1, patch)
-                np.dot(patch[0, :n], weights, m[:n])
+                multiply(patch[0, :n], weights, m[:n])
                 kept[1 + start : 1 + start + n] = m[:n]
         if row <= first:
             continue
