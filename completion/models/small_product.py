@@ -2,9 +2,9 @@
 
 BLAS libraries are made for large matrices: before each product they copy both factors into an order of their own, which
 at 16 x 64 times 64 x 64 costs more than the product. Here a block of 6 rows and 16 columns of the result stays in
-registers while one loop runs over the inner dimension: 12 vectors of 8, which with two of weights and one of inputs fill
-the 16 registers of AVX2. LLVM maps the same code to AVX-512 or NEON. A compiler does not find that arrangement in plain
-loops, so the block is written in its intermediate language.
+registers while one loop runs over the inner dimension: 12 vectors of 8, which with two of weights and one of inputs
+nearly fill the 16 registers of AVX2. LLVM maps the same code to AVX-512 or NEON. A compiler does not find that
+arrangement in plain loops, so the block is written in its intermediate language.
 """
 
 from __future__ import annotations
@@ -45,9 +45,7 @@ def _block(rows: int, vectors: int) -> Any:
         return types.void(a, at, at, b, at, at, c, at, at, at), generate
 
     def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        a, b, c = (
-            context.make_array(signature.args[place])(context, builder, args[place]).data for place in (0, 3, 6)
-        )
+        a, b, c = (context.make_array(signature.args[place])(context, builder, args[place]).data for place in (0, 3, 6))
         a_at, a_step, b_at, b_step, c_at, c_step, depth = (args[place] for place in (1, 2, 4, 5, 7, 8, 9))
         constant = depth.type
 

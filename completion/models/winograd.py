@@ -242,7 +242,7 @@ def convolve(first, last, x, y, z, summands, least, weights, bias, other, kind, 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def convolve_stem(first, last, planes, stem, stem_bias, weights, bias, other, kind, out):  # type: ignore[no-untyped-def]
-    """`convolve` of the rectified convolution of planes (K, H, W) by stem (9 K, I', see `stem_weights`) and its bias."""
+    """`convolve` of the rectified convolution of planes (K, H, W) by stem (9 K, I') and its bias (`stem_weights`)."""
     tiles, across, patch, work = _blocks(weights, out)
     kinds, columns = len(planes), patch.shape[1]
     stem_work = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pipeline.errors import UsageError
-from pipeline.experiments import chapter_2_3, chapter_4, chapter_5, chapter_5_exact, chapter_5_figures
+from pipeline.experiments import chapter_2_3, chapter_4, chapter_5, chapter_5_exact, chapter_5_figures, embedded
 from pipeline.experiments.tables import Table
 from pipeline.settings import nearest_name
 
@@ -13,6 +13,7 @@ TABLES: tuple[Table, ...] = (
     *chapter_5.TABLES,
     *chapter_5_exact.TABLES,
     *chapter_5_figures.TABLES,
+    embedded.TABLE,
 )
 
 

@@ -27,11 +27,13 @@ KINDS: dict[str, str] = {
     "analysis": "pipeline.experiments.analysis_runs",
     "detection": "pipeline.experiments.detection_runs",
     "cloud": "pipeline.experiments.cloud_runs",
+    "completer": "pipeline.experiments.embedded_runs",
+    "selection": "pipeline.experiments.embedded_runs",
 }
 
 
 # Kinds whose runs depend on no seed: one run, whatever the number of seeds asked for.
-UNSEEDED = ("cloud",)
+UNSEEDED = ("cloud", "completer")
 
 
 @dataclass(frozen=True)

@@ -28,5 +28,7 @@ def test_product_is_numpys_and_keeps_to_its_place(rows: int, inputs: int, lanes:
 def test_lanes_are_filled_with_zeros(outputs: int, whole: int) -> None:
     weights = np.arange(2 * 3 * outputs, dtype=np.float32).reshape(2, 3, outputs) + 1
     padded = with_whole_lanes(weights)
-    assert padded.shape == (2, 3, whole) and padded.flags.c_contiguous
-    assert (padded[..., :outputs] == weights).all() and not padded[..., outputs:].any()
+    assert padded.shape == (2, 3, whole)
+    assert padded.flags.c_contiguous
+    assert (padded[..., :outputs] == weights).all()
+    assert not padded[..., outputs:].any()
