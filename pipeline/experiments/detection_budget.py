@@ -29,7 +29,7 @@ class DetectorChoice:
     dense: str = ""
     start_steps: int = 0
     seconds_per_step: float = 0.4
-    seconds_per_frame: float = 0.2
+    seconds_per_frame: float = 0.38
 
 
 @dataclass(frozen=True)
