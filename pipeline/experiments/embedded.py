@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pipeline.experiments.tables import Claim, Column, Recipe, Row, Table
 
+# LiDAR rows at which every completer is scored.
+ROWS = (64, 16)
 COLUMNS = (
     Column("mae_mm", "MAE", "mm"),
     Column("rmse_mm", "RMSE", "mm"),
@@ -49,12 +51,10 @@ TABLE = Table(
     "The embedded completion network, a classical completion, and L2",
     "is it the loss that makes edges sharp?",
     COLUMNS,
-    tuple(
-        Row(_label(rows, name), recipe=recipe, view=str(rows)) for rows in (64, 16) for name, recipe in RECIPES.items()
-    ),
+    tuple(Row(_label(rows, name), recipe=recipe, view=str(rows)) for rows in ROWS for name, recipe in RECIPES.items()),
     tuple(
         Claim(f"{rows} rows: {text} in {title}", column, (_label(rows, better),), (_label(rows, worse),))
-        for rows in (64, 16)
+        for rows in ROWS
         for text, better, worse in ORDERS
         for column, title in JUDGED.items()
     ),

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.experiments.embedded import ROWS
 from pipeline.experiments.runs import Context, Cost, Outcome
 from pipeline.experiments.tables import Recipe
 from pipeline.experiments.worlds import open_world, world_identity
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from completion.types import DepthFrame
     from pipeline.data import Dataset, Frame
 
-ROWS = (64, 16)
 KEPT = ("mae_mm", "rmse_mm", "tmae_mm", "mixed_percent", "edge_tmae_mm")
 
 
