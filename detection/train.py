@@ -61,7 +61,8 @@ class TrainSettings:
     optimiser        the one-cycle schedule, over `steps`
     scene            scene augmentation, or None (the thesis uses none)
     paste            ground truth sampling, or None; objects come from `paste_frames` frames drawn at the start
-    warm_start       weights to begin with; input channels they lack start at zero, classes as a copy of similar ones
+    warm_start       weights to begin with, of the same network or of its first stage alone; input channels they lack
+                     start at zero, classes as a copy of similar ones
     save_every, log_every  steps
     cache_mb         memory for the visible points of frames, which are then read once instead of once per epoch
     """

@@ -1,4 +1,4 @@
-"""Starting a network with more input channels from one with fewer."""
+"""Starting a network from one with fewer input channels, or a two-stage one from its first stage."""
 
 from __future__ import annotations
 
@@ -12,17 +12,22 @@ _BEHIND = {"vfe.pfn_layers.0.linear.weight": 6}
 def copy_matching(source: nn.Module, target: nn.Module) -> list[str]:
     """Copy every weight; where `target` has more input columns, the new ones start at zero, so it computes the same.
 
+    Whole modules that only `target` has keep their weights: SECOND's are the first stage of Voxel-RCNN and PV-RCNN.
     Extra point channels are the last columns of the first set abstraction (x y z, extra) and of the last feature
     propagation (interpolated, skip); voxel encoders have them behind the point's others.
     Returns the names that were widened.
     Raises ValueError when names differ or a shape differs in another way.
     """
     old, new = source.state_dict(), target.state_dict()
-    if old.keys() != new.keys():
-        raise ValueError(f"warm start: the networks differ in {sorted(old.keys() ^ new.keys())[:5]}")
+    modules = {name.partition(".")[0] for name in old}
+    differing = old.keys() - new.keys() | {
+        name for name in new.keys() - old.keys() if name.partition(".")[0] in modules
+    }
+    if differing:
+        raise ValueError(f"warm start: the networks differ in {sorted(differing)[:5]}")
     widened = []
-    for name, value in new.items():
-        known = old[name]
+    for name, known in old.items():
+        value = new[name]
         if known.shape == value.shape:
             value.copy_(known)
             continue

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 # Where the seconds below were measured; another machine needs another time, not other results.
 MACHINE = "one core of a 2-core AMD EPYC server (AVX2), torch 2.13, process time"
+
+DEFAULT_DETECTOR = "PointRCNN2"
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,7 @@ class DetectorChoice:
                       published. Detectors have about the same time for it, not the same steps
     seconds_per_step  of two clouds; seconds_per_frame of detection; measured on MACHINE, except those of budget
                       paper, which are extrapolated from one forward pass (docs/detection.md)
+    first_stage       detector whose start this one's start begins with, as its first stage; "": random weights
     """
 
     preset: str
@@ -30,6 +33,7 @@ class DetectorChoice:
     start_steps: int = 0
     seconds_per_step: float = 0.4
     seconds_per_frame: float = 0.38
+    first_stage: str = ""
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,14 @@ class DetectionBudget:
     resamples: int = 300
     seconds_per_data_frame: float = 2.5
 
+    def part_for(self, settings: Mapping[str, Any]) -> DetectionBudget:
+        """The budget with the detectors alone that a run trains; unchanged for a detector it does not know."""
+        needed, name = {}, str(settings.get("detector", DEFAULT_DETECTOR))
+        while name in self.detectors and name not in needed:
+            needed[name] = self.detectors[name]
+            name = needed[name].first_stage
+        return replace(self, detectors=needed) if needed else self
+
 
 _POINT = ("height", "range")
 _RAW = ("intensity",)
@@ -69,24 +81,24 @@ def _small(points: int, width: float, start: int, seconds: float) -> DetectorCho
     return DetectorChoice("small", {"points": points, "width": width, "classes": ["Car"]}, _POINT, "", start, seconds)
 
 
-def _voxel(preset: str, options: Mapping[str, Any], start: int, seconds: float) -> DetectorChoice:
-    return DetectorChoice(preset, {**options, "classes": ["Car"]}, _RAW, "", start, seconds, 0.5)
+def _voxel(preset: str, cell: float, start: int, seconds: float, first_stage: str = "") -> DetectorChoice:
+    return DetectorChoice(preset, {"cell": cell, "classes": ["Car"]}, _RAW, "", start, seconds, 0.5, first_stage)
 
 
 _TINY = _small(512, 0.1, 2, 0.15)
 _SMALL = {
     "PointRCNN2": _small(4096, 0.5, 2000, 0.37),
-    "PointPillars": _voxel("pointpillars_small", {"cell": 0.64}, 1000, 0.51),
-    "SECOND": _voxel("second_small", {"cell": 0.2}, 700, 0.67),
-    "Voxel-RCNN": _voxel("voxel_rcnn_small", {"cell": 0.2}, 600, 1.05),
-    "PV-RCNN": _voxel("pv_rcnn_small", {"cell": 0.2}, 400, 1.37),
+    "PointPillars": _voxel("pointpillars_small", 0.64, 2000, 0.51),
+    "SECOND": _voxel("second_small", 0.2, 1800, 0.67),
+    "Voxel-RCNN": _voxel("voxel_rcnn_small", 0.2, 600, 1.05, "SECOND"),
+    "PV-RCNN": _voxel("pv_rcnn_small", 0.2, 500, 1.37, "SECOND"),
 }
 _SMOKE = {
     "PointRCNN2": _TINY,
-    "PointPillars": _voxel("pointpillars_small", {"cell": 2.56}, 2, 0.17),
-    "SECOND": _voxel("second_small", {"cell": 0.8}, 2, 0.5),
-    "Voxel-RCNN": _voxel("voxel_rcnn_small", {"cell": 0.8}, 2, 0.81),
-    "PV-RCNN": _voxel("pv_rcnn_small", {"cell": 0.8}, 2, 1.27),
+    "PointPillars": _voxel("pointpillars_small", 2.56, 2, 0.17),
+    "SECOND": _voxel("second_small", 0.8, 2, 0.5),
+    "Voxel-RCNN": _voxel("voxel_rcnn_small", 0.8, 2, 0.81, "SECOND"),
+    "PV-RCNN": _voxel("pv_rcnn_small", 0.8, 2, 1.27, "SECOND"),
 }
 _PAPER = {
     "PointRCNN": DetectorChoice("pointrcnn", seconds_per_step=10, seconds_per_frame=1.6),

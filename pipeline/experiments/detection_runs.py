@@ -18,7 +18,7 @@ from pipeline.errors import UsageError
 from pipeline.experiments import detection_scores as scores
 from pipeline.experiments.cloud_cache import CloudCache, DepthCache, short_hash
 from pipeline.experiments.common_start import Mixture, start_inputs
-from pipeline.experiments.detection_budget import DETECTION, DetectionBudget, DetectorChoice
+from pipeline.experiments.detection_budget import DEFAULT_DETECTOR, DETECTION, DetectionBudget, DetectorChoice
 from pipeline.experiments.example import write_example
 from pipeline.experiments.inputs import InputRecipe
 from pipeline.experiments.runs import Context, Cost, Outcome
@@ -56,7 +56,7 @@ class DetectionRecipe:
         base = InputRecipe(rows=int(settings.get("rows", 64)))
         train_input = with_changes(base, settings.get("input", {}), "input")
         test_input = with_changes(train_input, settings.get("test_input", {}), "test_input")
-        return cls(str(settings.get("detector", "PointRCNN2")), train_input, test_input)
+        return cls(str(settings.get("detector", DEFAULT_DETECTOR)), train_input, test_input)
 
 
 def data_identity(data: Path | None, budget: DetectionBudget) -> Any:
@@ -71,7 +71,10 @@ def cost(recipe: Recipe, budget: DetectionBudget) -> Cost:
     seconds = budget.steps * choice.seconds_per_step * budget.batch / 2 + budget.test_frames * choice.seconds_per_frame
     # Clouds are shared by seeds and detectors: a table has some six kinds of them.
     clouds = (5 * _MEGABYTE + 6 * 26.0 * budget.cloud_points) * frames
-    start = {choice.preset: choice.start_steps * choice.seconds_per_step * budget.batch / 2}
+    start = {
+        one.preset: one.start_steps * one.seconds_per_step * budget.batch / 2
+        for one in [choice, *([budget.detectors[choice.first_stage]] if choice.first_stage else [])]
+    }
     return Cost(seconds + 0.15 * frames, 5 * _MEGABYTE, budget.seconds_per_data_frame * frames, clouds, start)
 
 
@@ -156,9 +159,10 @@ def common_start(detector: str, frames: Dataset, context: Context) -> Path:
     """Weights that every row with this detector begins with, whatever its seed and input; trained once."""
     sources = [clouds_of(frames, kind, context) for kind in start_inputs(frames[0])]
     recipe = DetectionRecipe(detector, InputRecipe(), InputRecipe())
-    steps = detector_choice(recipe, context.budget).start_steps
-    settings = replace(train_settings(recipe, context), steps=steps, seed=0)
-    return _trained(settings, Mixture(sources), [source.folder.name for source in sources], None, context)
+    choice = detector_choice(recipe, context.budget)
+    first = common_start(choice.first_stage, frames, context) if choice.first_stage else None
+    settings = replace(train_settings(recipe, context), steps=choice.start_steps, seed=0)
+    return _trained(settings, Mixture(sources), [source.folder.name for source in sources], first, context)
 
 
 def _trained(

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from pipeline.errors import UsageError
 from pipeline.experiments.tables import Recipe
@@ -87,6 +87,14 @@ class Context:
     say: Callable[[str], None] = print
 
 
+@runtime_checkable
+class Divided(Protocol):
+    """A budget of which a run needs a part, so that what other runs are given changes nothing about it."""
+
+    def part_for(self, settings: Mapping[str, Any]) -> Any:
+        """The budget of a run with these settings."""
+
+
 class Kind(Protocol):
     """What a module in KINDS has.
 
@@ -155,6 +163,8 @@ def settings_of(budget: Any) -> dict[str, Any]:
 def plan_run(recipe: Recipe, budget: Any, data: Path | None, seed: int) -> Run:
     """The run of a recipe: its key is a hash of settings, budget, data and seed."""
     module = kind_module(recipe.kind)
+    if isinstance(budget, Divided):
+        budget = budget.part_for(recipe.settings)
     record = {
         "kind": recipe.kind,
         "settings": plain(recipe.settings),

@@ -15,6 +15,7 @@ from detection.kitti_format import KittiObject, boxes_of
 from detection.models.batch import PointBatch
 from detection.models.pointpillars import PointPillars
 from detection.models.pv_rcnn import PVRCNN
+from detection.models.second import SECOND
 from detection.models.warm_start import copy_matching
 from detection.ops import iou_3d
 from detection.optimiser import OneCycleSettings
@@ -127,3 +128,17 @@ def test_a_warm_start_with_one_more_column_computes_the_same(build) -> None:
     torch.testing.assert_close(first[1].bev, first[0].bev)
     if build is not tiny.tiny_pillars:
         torch.testing.assert_close(after.refined.reg, before.refined.reg)
+
+
+def test_a_two_stage_network_starts_from_the_first_stage_alone() -> None:
+    target = tiny.tiny_pv_rcnn()
+    source = SECOND(target.settings)
+    for weight in source.state_dict().values():
+        weight.copy_(torch.rand(weight.shape))
+    second_stage = target.roi_head.state_dict()
+    before = {name: weight.clone() for name, weight in second_stage.items()}
+    assert copy_matching(source, target) == []
+    assert all(torch.equal(target.state_dict()[name], weight) for name, weight in source.state_dict().items())
+    assert all(torch.equal(second_stage[name], weight) for name, weight in before.items())
+    with pytest.raises(ValueError, match="networks differ in"):
+        copy_matching(target, source)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +19,13 @@ from pipeline.experiments.catalogue import find
 from pipeline.experiments.chapter_5_findings import FINDINGS
 from pipeline.experiments.cloud_runs import picked_by_fps
 from pipeline.experiments.common_start import Mixture, start_inputs
+from pipeline.experiments.detection_budget import DETECTION
 from pipeline.experiments.findings import markdown as findings_page
 from pipeline.experiments.intervals import HOLDS, PERHAPS, judge, margin
 from pipeline.experiments.outputs import markdown, write_outputs
 from pipeline.experiments.plan import Order, TableResult, carry_out, gather, make_plan
-from pipeline.experiments.runs import Outcome
-from pipeline.experiments.tables import Table
+from pipeline.experiments.runs import Outcome, plan_run
+from pipeline.experiments.tables import Recipe, Table
 from tests.pipeline.data.vkitti2_tree import write_tree
 
 SMOKE_TABLES = ("5.8", "5.9", "5.1", "5.3", "5.6", "5.7")
@@ -225,3 +227,14 @@ def test_the_common_start_uses_what_the_data_has() -> None:
     assert len({json.dumps(recipe.record(), sort_keys=True) for recipe in recipes}) == len(recipes) == 9
     assert {recipe.depth_name for recipe in start_inputs(Frame("000001", scan, "kitti"))} == {None, "completed"}
     assert {recipe.rows for recipe in start_inputs(Frame("Scene01/clone/Camera_0/00000", truth, "vkitti2"))} == {64}
+
+
+def test_a_run_depends_on_its_own_detector_and_first_stage_alone() -> None:
+    budget = DETECTION["smoke"]
+    longer = replace(budget.detectors["SECOND"], start_steps=3)
+    changed = replace(budget, detectors={**budget.detectors, "SECOND": longer})
+    same = {}
+    for name in ("PointRCNN2", "SECOND", "Voxel-RCNN"):
+        recipe = Recipe("detection", {"detector": name})
+        same[name] = plan_run(recipe, budget, None, 0).key == plan_run(recipe, changed, None, 0).key
+    assert same == {"PointRCNN2": True, "SECOND": False, "Voxel-RCNN": False}
