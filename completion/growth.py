@@ -1,4 +1,4 @@
-"""Starting a wider network from a narrower one of the same kind, so that it computes the same at first."""
+"""Starting a network from another: from a narrower one of its kind, or from one with another head."""
 
 from __future__ import annotations
 
@@ -27,6 +27,24 @@ def grow(narrow: nn.Module, wide: nn.Module) -> list[str]:
             grown.append(name)
         _copy_leading(old, value)
     return grown
+
+
+@torch.no_grad()
+def adopt(source: nn.Module, target: nn.Module) -> list[str]:
+    """Copy every tensor of the same name and shape; returns the names that `target` keeps as built: its own head.
+
+    Raises ValueError when there is nothing in common.
+    """
+    known = source.state_dict()
+    own = []
+    for name, value in target.state_dict().items():
+        if name in known and known[name].shape == value.shape:
+            value.copy_(known[name])
+        else:
+            own.append(name)
+    if len(own) == len(target.state_dict()):
+        raise ValueError(f"warm start: nothing in common with the weights given, which have {sorted(known)[:3]} ...")
+    return own
 
 
 @torch.no_grad()

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from completion.checkpoints import Card, load_checkpoint, save_checkpoint
 from completion.diagnostics import diagnose
-from completion.growth import grow
+from completion.growth import adopt, grow
 from completion.infer import NetworkCompleter
 from completion.inputs import scale_rgb
 from completion.models import ModelSpec, build_model
@@ -52,7 +52,8 @@ class TrainSettings:
     scale_weights    (from epoch, weights of the outputs, finest first), ascending
     precision        "fp32", or "bf16" / "fp16" autocast on a GPU
     read_out         how validation reads one depth from the output; "" for the usual one
-    warm_start       weights (a path or an embedded name) to begin with, of the same network or a narrower one
+    warm_start       weights (a path or an embedded name) to begin with: of the same network, of a narrower one, or of
+                     another architecture with layers in common (its head stays as built)
     validate_every   steps between validations; 0: only at the end
     best_by          the validation figure that chooses the best checkpoint, lower is better
     log_every        steps between rows of log.csv
@@ -214,7 +215,9 @@ class _Run:
             torch.manual_seed(settings.seed)
             model = build_model(settings.model)
         if settings.warm_start is not None:
-            grow(load_checkpoint(settings.warm_start)[0], model)
+            start, card = load_checkpoint(settings.warm_start)
+            same = card.model.architecture == settings.model.architecture
+            (grow if same else adopt)(start, model)
         self.model = model.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.optimiser = torch.optim.Adam(
             self.model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay

@@ -12,6 +12,7 @@ from torch import nn
 from completion.depth_coefficients import Bins
 from completion.models.coefficients import CoefficientNetwork, CoefficientSparseToDense
 from completion.models.hourglass import MultiStack, Twise
+from completion.models.ring_coefficients import RingCoefficients
 from completion.models.selection import Selection
 from completion.models.sparse_to_dense import SparseToDense, TwinSparseToDense
 
@@ -84,6 +85,7 @@ MODELS: dict[str, Entry] = {
         partial(CoefficientSparseToDense, coefficient_input=False), 1.0, "unit", "coefficients", 16
     ),
     "resnet_dc_to_dc": Entry(CoefficientSparseToDense, 1.0, "unit", "coefficients", 16),
+    "ring_coefficients": Entry(RingCoefficients, 1.0, "standardised", "coefficients", 32),
     "selection": Entry(Selection, 1.0, "standardised", "mixture", 32),
 }
 
