@@ -81,7 +81,8 @@ def markdown(order: Order, result: TableResult) -> str:
     if any(row.printed for row in table.rows):
         lines.append(f"- {WARNING}")
     lines += [f"- {note[0].upper()}{note[1:]}." for note in table.notes]
-    lines += ["", "Ours: mean ± deviation over seeds [95 % interval]; below it, in brackets, the thesis' value.", ""]
+    shown = "Ours: mean ± deviation over seeds [95 % interval]; below it, in brackets, the thesis' value."
+    lines += ["", shown if table.of_thesis else "Mean ± deviation over seeds [95 % interval].", ""]
     lines += [
         "| | " + " | ".join(column.heading for column in table.columns) + " |",
         "|---|" + "---|" * len(table.columns),
@@ -105,7 +106,8 @@ def markdown(order: Order, result: TableResult) -> str:
 def _claims(result: TableResult) -> list[str]:
     if not result.verdicts:
         return []
-    lines = ["", "## Orderings that the thesis claims", "", "| claim | in our runs | margin, paired |", "|---|---|---|"]
+    whose = "Orderings that the thesis claims" if result.table.of_thesis else "Orderings"
+    lines = ["", f"## {whose}", "", "| claim | in our runs | margin, paired |", "|---|---|---|"]
     return lines + [f"| {v.text} | **{v.verdict}** | {v.evidence} |" for v in result.verdicts]
 
 

@@ -29,6 +29,11 @@ class Column:
             raise ValueError(f"better: expected 'lower', 'higher' or '', got {self.better!r}")
 
     @property
+    def of_thesis(self) -> bool:
+        """False for the tables that only this project has; those have names in place of numbers."""
+        return self.number[0].isdigit()
+
+    @property
     def heading(self) -> str:
         """Title with its unit."""
         return f"{self.title} [{self.unit}]" if self.unit else self.title
@@ -139,6 +144,11 @@ class Table:
     def name(self) -> str:
         """ "table_4.5", "table_5.3_16_rows"; stem of the files written."""
         return f"{self.kind}_{self.number}" + (f"_{self.lidar_rows}_rows" if self.lidar_rows else "")
+
+    @property
+    def of_thesis(self) -> bool:
+        """False for the tables that only this project has; those have names in place of numbers."""
+        return self.number[0].isdigit()
 
     @property
     def heading(self) -> str:
