@@ -88,10 +88,10 @@ def _voxel(preset: str, cell: float, start: int, seconds: float, first_stage: st
 _TINY = _small(512, 0.1, 2, 0.15)
 _SMALL = {
     "PointRCNN2": _small(4096, 0.5, 2000, 0.37),
-    "PointPillars": _voxel("pointpillars_small", 0.64, 1200, 0.51),
+    "PointPillars": _voxel("pointpillars_small", 0.64, 1000, 0.51),
     "SECOND": _voxel("second_small", 0.2, 1200, 0.67),
-    "Voxel-RCNN": _voxel("voxel_rcnn_small", 0.2, 400, 1.05, "SECOND"),
-    "PV-RCNN": _voxel("pv_rcnn_small", 0.2, 300, 1.37, "SECOND"),
+    "Voxel-RCNN": _voxel("voxel_rcnn_small", 0.2, 350, 1.05, "SECOND"),
+    "PV-RCNN": _voxel("pv_rcnn_small", 0.2, 250, 1.37, "SECOND"),
 }
 _SMOKE = {
     "PointRCNN2": _TINY,

@@ -90,7 +90,7 @@ def run(recipe: Recipe, context: Context) -> Outcome:
     name: str | Path = str(recipe.settings.get("completer", ""))
     if recipe.kind == "selection":
         name = _trained(recipe, world.train, context)
-    return score(load_completer(name), world.test)
+    return score(load_completer(name, backend="auto"), world.test)
 
 
 def train_settings(recipe: Recipe, budget: EmbeddedBudget, seed: int) -> TrainSettings:
