@@ -29,11 +29,6 @@ class Column:
             raise ValueError(f"better: expected 'lower', 'higher' or '', got {self.better!r}")
 
     @property
-    def of_thesis(self) -> bool:
-        """False for the tables that only this project has; those have names in place of numbers."""
-        return self.number[0].isdigit()
-
-    @property
     def heading(self) -> str:
         """Title with its unit."""
         return f"{self.title} [{self.unit}]" if self.unit else self.title
