@@ -35,14 +35,14 @@ def adopt(source: nn.Module, target: nn.Module) -> list[str]:
 
     Raises ValueError when there is nothing in common.
     """
-    known = source.state_dict()
+    known, wanted = source.state_dict(), target.state_dict()
     own = []
-    for name, value in target.state_dict().items():
+    for name, value in wanted.items():
         if name in known and known[name].shape == value.shape:
             value.copy_(known[name])
         else:
             own.append(name)
-    if len(own) == len(target.state_dict()):
+    if len(own) == len(wanted):
         raise ValueError(f"warm start: nothing in common with the weights given, which have {sorted(known)[:3]} ...")
     return own
 

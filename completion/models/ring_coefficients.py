@@ -17,7 +17,7 @@ from completion.models.coefficients import encode_map
 from completion.models.rings import Rings, find_rings
 from completion.models.selection import INPUTS, PixelUNet, depth_features
 
-# Probability of a bin that no sample speaks for, before training; 82 of them together are an eighth of a sample.
+# Probability of a bin that no sample speaks for, before training: all 82 weigh an eighth of what one sample does.
 FLOOR = 5e-4
 
 
@@ -44,5 +44,5 @@ class RingCoefficients(nn.Module):
 
 def ring_coefficients(rings: Rings, bins: Bins) -> Tensor:
     """(B, channels, H, W): mean of the coefficients of the sample above, the one below and their interpolation."""
-    parts = (encode_map(depth, bins) for depth in (rings.above, rings.below, rings.between))
-    return sum(parts, torch.zeros((), device=rings.between.device)) / 3
+    above, below, between = (encode_map(depth, bins) for depth in (rings.above, rings.below, rings.between))
+    return (above + below + between) / 3

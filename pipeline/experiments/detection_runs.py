@@ -71,10 +71,8 @@ def cost(recipe: Recipe, budget: DetectionBudget) -> Cost:
     seconds = budget.steps * choice.seconds_per_step * budget.batch / 2 + budget.test_frames * choice.seconds_per_frame
     # Clouds are shared by seeds and detectors: a table has some six kinds of them.
     clouds = (5 * _MEGABYTE + 6 * 26.0 * budget.cloud_points) * frames
-    start = {
-        one.preset: one.start_steps * one.seconds_per_step * budget.batch / 2
-        for one in [choice, *([budget.detectors[choice.first_stage]] if choice.first_stage else [])]
-    }
+    trained = budget.part_for(recipe.settings).detectors.values()
+    start = {one.preset: one.start_steps * one.seconds_per_step * budget.batch / 2 for one in trained}
     return Cost(seconds + 0.15 * frames, 5 * _MEGABYTE, budget.seconds_per_data_frame * frames, clouds, start)
 
 
