@@ -20,11 +20,13 @@ from completion.checkpoints import Card, write_atomically
 from completion.models import hourglass_cpu
 from completion.models.hourglass import Hourglasses
 from completion.models.pixel_unet_cpu import PixelUNetKernels
-from completion.models.selection import INPUTS, Selection
+from completion.models.ring_coefficients import RingCoefficients
+from completion.models.selection import CANDIDATES, INPUTS, Selection
 
 BACKENDS = ("torch", "numba", "onnxruntime", "openvino", "auto")
 # Pure convolutions; the others encode depth or are too large to be worth it.
 EXPORTABLE = ("selection", "twise", "msg_chn")
+OWN_KERNELS = (*EXPORTABLE, "ring_coefficients")
 OPSET = 17
 # Part of the file names: raise it when the exported part of a network changes.
 EXPORT_VERSION = 1
@@ -53,14 +55,15 @@ def other_than_torch(model: nn.Module, card: Card, device: str, backend: str) ->
 
     ValueError for a network or device that `backend` cannot run, ImportError when its packages are missing.
     """
-    fits = card.model.architecture in EXPORTABLE and torch.device(device).type == "cpu"
+    can = OWN_KERNELS if backend in ("numba", "auto") else EXPORTABLE
+    fits = card.model.architecture in can and torch.device(device).type == "cpu"
     if backend == "auto":
         backend = "numba" if fits else "torch"
     if backend == "torch":
         return None
     if not fits:
         raise ValueError(
-            f"backend {backend!r} runs {', '.join(EXPORTABLE)} on the CPU, not {card.model.architecture} on {device}; "
+            f"backend {backend!r} runs {', '.join(can)} on the CPU, not {card.model.architecture} on {device}; "
             "use backend 'torch'"
         )
     if backend == "numba":
@@ -76,6 +79,8 @@ def other_than_torch(model: nn.Module, card: Card, device: str, backend: str) ->
 def own_kernels(model: nn.Module) -> Convolutions:
     """Our Winograd convolutions (`models.winograd`) with as many threads as torch."""
     if isinstance(model, Selection):
+        return PixelUNetKernels(model.network, outputs=2 * CANDIDATES)  # no read-out needs the scale
+    if isinstance(model, RingCoefficients):
         return PixelUNetKernels(model.network)
     assert isinstance(model, Hourglasses), type(model)
     return hourglass_cpu.convolutions(model)

@@ -21,6 +21,8 @@ from completion.checkpoints import load_checkpoint
 from completion.inputs import scale_rgb
 from completion.models import ModelSpec
 from completion.models.classical import ClassicalCompleter
+from completion.models.pixel_unet_cpu import PixelUNetKernels
+from completion.models.ring_coefficients_cpu import complete_coefficients
 from completion.models.selection import Selection
 from completion.models.selection_cpu import complete_mixture
 from completion.readout import Maps, read_output, require_read_out
@@ -90,6 +92,8 @@ class NetworkCompleter:
         """(B, 1, h, w), (B, 3, h, w) uint8 -> depth, foreground, background, sigma, each (B, h, w) or None."""
         if isinstance(self.model, Selection) and self.device.type == "cpu":
             return self._run_selection(self.model, sparse, rgb)
+        if isinstance(self.convolutions, PixelUNetKernels):
+            return self._run_coefficients(self.convolutions, sparse, rgb), None, None, None
         return read_output(self._network_output(sparse, rgb), self.spec, self.read_out)
 
     def _network_output(self, sparse: Tensor, rgb: Tensor) -> Tensor:
@@ -117,6 +121,13 @@ class NetworkCompleter:
         ]
         depth, foreground, background, sigma = (torch.from_numpy(np.stack(maps)) for maps in zip(*frames))
         return depth, foreground, background, sigma
+
+    def _run_coefficients(self, kernels: PixelUNetKernels, sparse: Tensor, rgb: Tensor) -> Tensor:
+        frames = [
+            complete_coefficients(self.spec.bins, kernels, one[0].numpy(), image.numpy(), self.spec.rgb, self.read_out)
+            for one, image in zip(sparse, rgb.permute(0, 2, 3, 1))
+        ]
+        return torch.from_numpy(np.stack(frames))
 
 
 def load_completer(path_or_name: str | Path, device: str = "cpu", backend: str = "torch") -> Completer:

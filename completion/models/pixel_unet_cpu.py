@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from completion.models import winograd
-from completion.models.selection import CANDIDATES, PixelUNet, Residual
+from completion.models.selection import PixelUNet, Residual
 from completion.models.shared_rows import SharedRows
 from completion.models.small_product import with_whole_lanes
 from completion.models.winograd import LINEAR, NOTHING, RECTIFIED, SAME
@@ -23,11 +23,13 @@ Float = NDArray[np.float32]
 class PixelUNetKernels:
     """The convolutions of a U-Net with its weights at the time of this call, and as many threads as torch has then.
 
-    head  (2, C, 40) weights and (2, 40) biases: what `selection_cpu` reads of the last layer, for even and odd rows
-    lock  to be held while the result of `before_head` is in use: its memory is kept from frame to frame
+    outputs  how many of the network's outputs are read (None: all): the first ones
+    head     (2, C, 2 outputs) weights and (2, 2 outputs) biases of the last layer, for even and odd rows; columns for
+             even and odd pixels side by side, zeros up to whole lanes
+    lock     to be held while the result of `before_head` is in use: its memory is kept from frame to frame
     """
 
-    def __init__(self, network: PixelUNet) -> None:
+    def __init__(self, network: PixelUNet, outputs: int | None = None) -> None:
         self.network = network
         self.rows = SharedRows(torch.get_num_threads())
         self.lock = threading.Lock()
@@ -36,7 +38,8 @@ class PixelUNetKernels:
         self.down = [(winograd.quarter_weights(one.weight), winograd.bias_of(one)) for one in network.down]  # type: ignore[arg-type]
         self.up = [(with_whole_lanes(_array(one.weight[:, :, 0, 0].T)), winograd.bias_of(one)) for one in network.up]  # type: ignore[index]
         self.decoder = [_residual(one) for one in network.decoder]
-        self.head = _head(network.head.weight[:, :, 0, 0]), _head(_tensor(network.head.bias))
+        read = network.head.weight[:, :, 0, 0], _tensor(network.head.bias)
+        self.head = _head(read[0], outputs), _head(read[1], outputs)
 
     def __call__(self, features: Tensor) -> Tensor:
         """(1, 4 inputs, H/2, W/2) -> (1, 4 outputs, H/2, W/2), like `PixelUNet.at_half`."""
@@ -103,11 +106,11 @@ def _residual(block: nn.Module) -> tuple[tuple[Float, Float], tuple[Float, Float
     return _winograd(block.conv1), _winograd(block.conv2)
 
 
-def _head(parameters: Tensor) -> Float:
-    """Rows (4 outputs, ...) of the last layer -> (2, ..., 40): row of the image; output and column of the image.
+def _head(parameters: Tensor, outputs: int | None) -> Float:
+    """Rows (4 outputs, ...) of the last layer -> (2, ..., 2 outputs): row of the image; output and column of the image.
 
-    Undoes the pixel shuffle, and leaves out the scale, which no read-out needs.
+    Undoes the pixel shuffle.
     """
-    shuffled = parameters.detach().unflatten(0, (-1, 2, 2))[: 2 * CANDIDATES]
+    shuffled = parameters.detach().unflatten(0, (-1, 2, 2))[:outputs]
     rest = tuple(range(3, shuffled.ndim))
-    return _array(shuffled.permute(1, *rest, 0, 2).flatten(-2))
+    return with_whole_lanes(_array(shuffled.permute(1, *rest, 0, 2).flatten(-2)))

@@ -25,14 +25,15 @@ class RingCoefficients(nn.Module):
     """`forward(sparse, rgb) -> (logits,)`: sparse (B, 1, H, W) metres, rgb (B, 3, H, W) standardised.
 
     logits (B, channels, H, W), to be trained by cross-entropy (Eq. 3.3). H and W must be multiples of 32.
+    `ring_coefficients_cpu` does the same faster for inference on the CPU.
 
-    width                features at half resolution; those of `Selection` at the same width can be a start
-    count, size, layout  see `Bins`
+    width        features at half resolution; those of `Selection` at the same width can be a start
+    count, size  see `Bins`; always with guard bins
     """
 
-    def __init__(self, width: int = 24, count: int = 80, size: float = 1.0, layout: str = "guard") -> None:
+    def __init__(self, width: int = 24, count: int = 80, size: float = 1.0) -> None:
         super().__init__()
-        self.bins = Bins(count, size, layout)
+        self.bins = Bins(count, size)
         self.network = PixelUNet(INPUTS, self.bins.channels, width)
 
     def forward(self, sparse: Tensor, rgb: Tensor) -> tuple[Tensor]:

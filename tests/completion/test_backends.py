@@ -17,6 +17,7 @@ from completion.readout import default_read_out
 from tests.completion.scenes import street
 
 SMALL = {"selection": {"width": 8}, "twise": {"channels": 8}, "msg_chn": {"channels": 4}}
+OWN = {**SMALL, "ring_coefficients": {"width": 8}}
 NEEDS = {"numba": (), "onnxruntime": ("onnx", "onnxruntime"), "openvino": ("onnx", "openvino")}
 
 
@@ -28,7 +29,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def saved(folder: Path, architecture: str, seed: int = 0) -> Path:
     torch.manual_seed(seed)
-    spec = default_spec(architecture, **SMALL[architecture])
+    spec = default_spec(architecture, **OWN[architecture])
     model = build_model(spec)
     if architecture == "selection":
         torch.nn.init.normal_(model.network.head.weight, std=0.3)
@@ -73,7 +74,7 @@ def test_a_cache_that_cannot_be_written_is_no_obstacle(tmp_path: Path, monkeypat
     assert found.convolutions is not None
 
 
-@pytest.mark.parametrize("architecture", sorted(SMALL))
+@pytest.mark.parametrize("architecture", sorted(OWN))
 def test_auto_needs_no_further_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, architecture: str) -> None:
     monkeypatch.setattr(backends, "find_spec", lambda name: None)
     found = load_completer(saved(tmp_path, architecture), backend="auto")

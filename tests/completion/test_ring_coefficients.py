@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from completion.backends import own_kernels
 from completion.depth_coefficients import Bins, decode_logits
 from completion.growth import adopt
 from completion.infer import NetworkCompleter
@@ -75,6 +76,31 @@ def test_it_begins_with_the_layers_of_a_selection_network() -> None:
     assert torch.equal(head, target.network.head.weight)
     with pytest.raises(ValueError, match="nothing in common"):
         adopt(torch.nn.Linear(2, 2), target)
+
+
+@pytest.mark.parametrize(("read_out", "threads"), [("peak", 1), ("peak", 2), ("all", 1)])
+def test_the_fast_pass_agrees_with_torch(read_out: str, threads: int) -> None:
+    """Uneven sizes, empty and dense maps, coarse bins that near and far depths leave: the same depth to a millimetre,
+    but for pixels whose two largest coefficients are equal to rounding."""
+    torch.manual_seed(3)
+    spec = default_spec("ring_coefficients", width=8, count=30, size=2.0)
+    model = RingCoefficients(width=8, count=30, size=2.0)
+    torch.nn.init.normal_(model.network.head.weight, std=0.5)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        fast = NetworkCompleter(model, spec, read_out=read_out, convolutions=own_kernels(model))
+    finally:
+        torch.set_num_threads(before)
+    slow = NetworkCompleter(model, spec, read_out=read_out)
+    for height, width, row_step in ((75, 200, 9), (64, 96, 1), (33, 131, 500)):
+        frame = street(7, height, width, row_step)
+        found, expected = (one.complete(frame.sparse, frame.image) for one in (fast, slow))
+        assert found.foreground is None
+        assert np.mean(np.abs(found.depth - expected.depth) > 1e-3) < 1e-4
+    batch = fast.complete_batch([street(seed, 64, 96) for seed in (1, 2)])
+    alone = fast.complete(street(2, 64, 96).sparse, street(2, 64, 96).image)
+    np.testing.assert_array_equal(batch[1].depth, alone.depth)
 
 
 def test_any_image_size_completes_to_one_depth() -> None:
