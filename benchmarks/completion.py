@@ -254,6 +254,22 @@ def embedded_measures(name: str, repeats: int, limits: dict[str, float]) -> list
     return [measure_of(each) for each in table]
 
 
+def coefficient_measures(name: str, repeats: int) -> list[Measure]:
+    """The embedded Depth Coefficients network on a whole frame: our pass and the tensor operations it repeats."""
+    model, card = load_checkpoint(name)
+    ways = {OWN: own_kernels(model), "torch, channels last": None}
+    runs = {
+        label: NetworkCompleter(model, card.model, read_out=card.read_out, convolutions=way)
+        for label, way in ways.items()
+    }
+    frame = streets(1, first=1)[0]
+    calls: dict[str, Callable[[], Any]] = {label: partial(depth_of, run, frame) for label, run in runs.items()}
+    ours = calls.pop(OWN)
+    row = compare("Depth Coefficients completer, 375x1242", ours, calls, repeats, nearly_everywhere)
+    print(format_table([row]), "\n")
+    return [measure_of(row)]
+
+
 def depth_of(completer: NetworkCompleter, frame: DepthFrame) -> NDArray[np.float32]:
     """Completed depth."""
     return completer.complete(frame.sparse, frame.image).depth
@@ -292,6 +308,7 @@ def main() -> None:
     channels, size = (8, (96, 320)) if options.quick else (64, (352, 1216))
     measures = twise_measures(channels, size, options.repeats, limits)
     measures += embedded_measures(options.network, options.repeats if options.quick else 9, limits)
+    measures += coefficient_measures("dc_small", options.repeats)
     save(options.json, measures)
 
 

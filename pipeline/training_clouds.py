@@ -111,11 +111,12 @@ class ThinnedClouds:
     def _tools(self) -> tuple[AugmentSettings | None, Completer | None]:
         if uses_raw_lidar(self.config):
             return None, None
-        return augment_settings(self.config), _completer(self.config.completion.model, self.config.completion.device)
+        completion = self.config.completion
+        return augment_settings(self.config), _completer(completion.model, completion.device, completion.backend)
 
 
 @lru_cache(maxsize=1)
-def _completer(name: str, device: str) -> Completer:
+def _completer(name: str, device: str, backend: str) -> Completer:
     from completion.infer import load_completer
 
-    return load_completer(name, device)
+    return load_completer(name, device, backend)

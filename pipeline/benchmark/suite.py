@@ -66,7 +66,7 @@ def _method(name: str) -> Callable[[NDArray[np.float32], NDArray[np.uint8]], NDA
     if name in PEERS:
         peer = PEERS[name]
         return lambda sparse, image: peer(sparse)
-    completer: Completer = load_completer(name)
+    completer: Completer = load_completer(name, backend="auto")
     return lambda sparse, image: completer.complete(sparse, image).depth
 
 
@@ -83,7 +83,7 @@ def _means(entries: list[dict[str, float]]) -> dict[str, Any]:
 
 def detection_scores(dataset: Dataset, rows: Iterable[DetectionRow], completer: str, progress: Progress) -> list[Any]:
     """Recall and precision of cars for every row, from above and in 3D at IoU 0.5 and 0.7."""
-    complete = load_completer(completer)
+    complete = load_completer(completer, backend="auto")
     results = []
     for row in rows:
         detector = load_detector(row.detector, seed=0)
