@@ -10,7 +10,7 @@ import pytest
 from detection.kitti_format import KittiObject
 from pipeline import embedding
 from pipeline.data import open_dataset
-from pipeline.embedding import AT_THRESHOLD, ROOMS, HeldOut, main, operating_point, segmentation_figures, without_places
+from pipeline.embedding import AT_THRESHOLD, ROOMS, main, operating_point, segmentation_figures, without_places
 from pipeline.errors import UsageError
 from pipeline.semantics.conventions import NONE
 from pipeline.semantics.network import NetworkSegmenter
