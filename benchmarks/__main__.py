@@ -1,7 +1,7 @@
 """`python -m benchmarks` (or `make bench`): every comparison with peers in one run.
 
-Writes benchmarks/RESULTS.md (targets first) and RESULTS.png, and compares the ratios with benchmarks/baseline.json:
-exit code 1 when a result disagrees with its peer's or a ratio fell by more than a fifth. Run it on an idle machine.
+Writes benchmarks/RESULTS.md (targets first) and RESULTS.png, and compares the ratios with those that benchmarks/baseline.json
+holds for this kind of machine: exit code 1 when a result disagrees with its peer's or a ratio fell by more than a fifth. Run it on an idle machine.
 Each part is a module of its own with more options: `python -m benchmarks.ops --help`.
 """
 
@@ -79,14 +79,37 @@ def run_part(part: Part, quick: bool, folder: Path) -> tuple[str, list[Measure],
 
 def machine() -> str:
     """Processor, cores and load."""
-    model = platform.machine()
-    information = Path("/proc/cpuinfo")
-    if information.is_file():
-        lines = information.read_text(encoding="utf-8").splitlines()
-        model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), model)
     when = time.strftime("%Y-%m-%d", time.gmtime())
     load = os.getloadavg()[0]
-    return f"{when}, {model}, {os.cpu_count()} cores, load {load:.1f} at the start, Python {platform.python_version()}."
+    python = platform.python_version()
+    return f"{when}, {processor('model name')}, {os.cpu_count()} cores, load {load:.1f} at the start, Python {python}."
+
+
+def kind_of_machine() -> str:
+    """What a baseline belongs to: processor, cores and widest vector instructions; ratios depend on them."""
+    flags = processor("flags").split()
+    vectors = next((name for name in ("avx512f", "avx2", "avx") if name in flags), "no AVX")
+    return f"{processor('model name')}, {os.cpu_count()} cores, {vectors}"
+
+
+def processor(field: str) -> str:
+    """A field of the first processor; the architecture where the system does not tell."""
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text(encoding="utf-8").splitlines() if information.is_file() else []
+    return next((line.split(":")[1].strip() for line in lines if line.startswith(field)), platform.machine())
+
+
+def read_baselines(path: Path) -> dict[str, dict[str, float]]:
+    """Kind of machine -> ratios kept there by --save-baseline."""
+    kept: dict[str, dict[str, float]] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return kept
+
+
+def agreement(kind: str, known: bool) -> str:
+    """What is said when no ratio got worse."""
+    if known:
+        return "No ratio fell by more than a fifth of the baseline's."
+    return f"No baseline of this kind of machine ({kind}) to compare with; --save-baseline keeps one."
 
 
 def main() -> int:
@@ -107,7 +130,7 @@ def main() -> int:
     curves: list[Curve] = []
     worse: list[str] = []
     wrong: list[str] = []
-    baseline = json.loads(BASELINE.read_text(encoding="utf-8")) if BASELINE.is_file() else {}
+    kind, baselines = kind_of_machine(), read_baselines(BASELINE)
     options.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         for part in PARTS:
@@ -116,25 +139,27 @@ def main() -> int:
                 sections.append(section)
                 measures += found
                 curves += grown
-                worse = got_worse(ratios(measures), baseline)
+                worse = got_worse(ratios(measures), baselines.get(kind, {}))
                 wrong = [item.case for item in measures if item.agree is False]
                 # After every part: a run that is stopped leaves what it measured.
-                text = results(head, measures, worse, wrong, sections)
+                compared = worse or [agreement(kind, kind in baselines)]
+                text = results(head, measures, compared, wrong, sections)
                 (options.out / "RESULTS.md").write_text(text, encoding="utf-8")
     draw(measures, curves, options.out / "RESULTS.png")
     if options.save_baseline:
-        BASELINE.write_text(json.dumps(ratios(measures), indent=1, sort_keys=True) + "\n", encoding="utf-8")
+        baselines[kind] = ratios(measures)
+        BASELINE.write_text(json.dumps(baselines, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     print(options.out / "RESULTS.md")
     print("\n".join([*worse, *(f"{case}: results disagree" for case in wrong)]))
     return 1 if worse or wrong else 0
 
 
-def results(head: str, measures: list[Measure], worse: list[str], wrong: list[str], sections: list[str]) -> str:
-    """RESULTS.md."""
-    compared = "\n".join(f"- {line}" for line in worse) or "- No ratio fell by more than a fifth of the baseline's."
+def results(head: str, measures: list[Measure], compared: list[str], wrong: list[str], sections: list[str]) -> str:
+    """RESULTS.md; `compared` says what became of the baseline's ratios."""
+    verdict = "\n".join(f"- {line}" for line in compared)
     doubts = "".join(f"\n- {case}: **results disagree**" for case in wrong)
     picture = "![Times better than each best peer, and how costs grow](RESULTS.png)"
-    top = f"# Benchmarks\n\n{head}\n\n## Targets\n\n{summary(measures)}\n{compared}{doubts}\n\n{picture}\n"
+    top = f"# Benchmarks\n\n{head}\n\n## Targets\n\n{summary(measures)}\n{verdict}{doubts}\n\n{picture}\n"
     return "\n".join([top, *sections])
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from pathlib import Path
 
-from benchmarks.__main__ import PARTS, Part, results, run_part
+from benchmarks.__main__ import BASELINE, PARTS, Part, agreement, kind_of_machine, read_baselines, results, run_part
 from benchmarks.record import Measure
 
 
@@ -27,3 +27,10 @@ def test_the_page_begins_with_targets_and_what_got_worse() -> None:
     assert "- a: 1.00, was 2.00" in page
     assert "- b: **results disagree**" in page
     assert page.index("## Targets") < page.index("## Part")
+
+
+def test_a_baseline_belongs_to_a_kind_of_machine(tmp_path: Path) -> None:
+    assert kind_of_machine() == kind_of_machine()
+    assert agreement("a Pentium, 1 cores, no AVX", known=False).startswith("No baseline of this kind of machine (a Pen")
+    assert read_baselines(tmp_path / "none.json") == {}
+    assert all(all(ratio > 0 for ratio in kept.values()) for kept in read_baselines(BASELINE).values())
