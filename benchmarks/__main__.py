@@ -1,7 +1,8 @@
 """`python -m benchmarks` (or `make bench`): every comparison with peers in one run.
 
-Writes benchmarks/RESULTS.md (targets first) and RESULTS.png, and compares the ratios with those that benchmarks/baseline.json
-holds for this kind of machine: exit code 1 when a result disagrees with its peer's or a ratio fell by more than a fifth. Run it on an idle machine.
+Writes benchmarks/RESULTS.md (targets first) and RESULTS.png, and compares the ratios with those that
+benchmarks/baseline.json holds for this kind of machine: exit code 1 when a result disagrees with its peer's or a ratio
+fell by more than a fifth. Run it on an idle machine.
 Each part is a module of its own with more options: `python -m benchmarks.ops --help`.
 """
 
