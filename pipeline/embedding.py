@@ -159,14 +159,20 @@ def embed(room: str, run: Path, name: str, held_out: HeldOut) -> Path:
     """Copies the run's weights and its card with the figures into the package. Raises UsageError without weights."""
     source = weights_of(room, run)
     card = json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))
-    card |= {"name": name, "held_out": held_out.figures(room, source)}
-    if room == "detection":
-        card |= {"cloud": held_out.cloud, "score_threshold": card["held_out"][AT_THRESHOLD]["threshold"]}
+    card |= {"name": name, **measured(room, source, held_out)}
     target = embedded_folder(ROOMS[room]) / f"{name}.safetensors"
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(source, target)
     write_card(target.with_suffix(".json"), card)
     return target
+
+
+def measured(room: str, weights: Path, held_out: HeldOut) -> dict[str, Any]:
+    """The entries of a card that come from the held-out frames."""
+    figures = held_out.figures(room, weights)
+    if room != "detection":
+        return {"held_out": figures}
+    return {"held_out": figures, "cloud": held_out.cloud, "score_threshold": figures[AT_THRESHOLD]["threshold"]}
 
 
 def note_again(room: str, run: Path, name: str, held_out: HeldOut) -> Path:
@@ -181,12 +187,11 @@ def note_again(room: str, run: Path, name: str, held_out: HeldOut) -> Path:
     card = json.loads(path.read_text(encoding="utf-8"))
     other = json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))
     if card.get("held_out", {}).get("frames") != len(held_out.dataset):
-        card |= {"held_out": held_out.figures(room, embedded), "trained_again": []}
+        card |= {**measured(room, embedded, held_out), "trained_again": []}
     seed = other["seed"] if "seed" in other else other["training"].get("settings", other["training"])["seed"]
     repeat = {"seed": seed, "sha256": other["sha256"], "held_out": held_out.figures(room, source)}
-    card["trained_again"] = [each for each in card.get("trained_again", []) if each["sha256"] != repeat["sha256"]] + [
-        repeat
-    ]
+    others = [each for each in card.get("trained_again", []) if each["sha256"] != repeat["sha256"]]
+    card["trained_again"] = [*others, repeat]
     write_card(path, card)
     return path
 
