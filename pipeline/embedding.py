@@ -114,7 +114,7 @@ def detections(weights: Path, held_out: HeldOut, rows: int) -> tuple[Objects, Ob
 
 
 def average_precision(labels: Objects, found: Objects) -> dict[str, list[float | None]]:
-    """ "CLASS METRIC IOU" -> AP R40 easy, moderate, hard; from above and in 3D."""
+    """AP R40 easy, moderate, hard by "CLASS METRIC IOU"; from above and in 3D."""
     from detection.evaluation.kitti_ap import evaluate
 
     return {

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -14,7 +15,7 @@ from torch.nn import functional as F
 from completion.models import winograd
 from completion.models.selection import PixelUNet, Residual
 from completion.models.shared_rows import SharedRows
-from completion.models.small_product import with_whole_lanes
+from completion.models.small_product import multiply, with_whole_lanes
 from completion.models.winograd import LINEAR, NOTHING, RECTIFIED, SAME
 
 Float = NDArray[np.float32]
@@ -86,6 +87,18 @@ class PixelUNetKernels:
         out = self.rows.map(name, *skip.shape)
         self.rows.run(winograd.lift, len(x), x, *layer, skip, out)
         return out
+
+
+@njit(inline="always")
+def head_of(row, first, weights, rectified, out):  # type: ignore[no-untyped-def]
+    """The last layer without its bias for len(out) pixels of a row (W/2, C) of `before_head` from `first` on.
+
+    weights (C, O) of `PixelUNetKernels.head`, rectified (n, C) for use inside, out (n, O)
+    """
+    for i in range(len(out)):
+        for c in range(row.shape[1]):
+            rectified[i, c] = max(row[first + i, c], np.float32(0))
+    multiply(rectified, weights, out)
 
 
 def _tensor(bias: Tensor | None) -> Tensor:

@@ -13,9 +13,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from completion.depth_coefficients import Bins
-from completion.models.pixel_unet_cpu import PixelUNetKernels
+from completion.models.pixel_unet_cpu import PixelUNetKernels, head_of
 from completion.models.ring_coefficients import FLOOR
-from completion.models.small_product import multiply
 from completion.models.unet_inputs_cpu import Float, in_threads, unet_inputs
 from completion.models.vector_exp import exp
 
@@ -79,10 +78,7 @@ def _read_features(first, last, features, kernels, bias, rings, top, size, chann
         source, side = (y + top) // 2, (y + top) % 2
         for start in range(0, out.shape[1], _RUN):
             count = min(_RUN, rings.shape[2] - start) // 2
-            for i in range(count):
-                for c in range(features.shape[2]):
-                    rectified[i, c] = max(features[source, start // 2 + i, c], _ZERO)
-            multiply(rectified[:count], kernels[side], head[:count])
+            head_of(features[source], start // 2, kernels[side], rectified[:count], head[:count])
             for c in range(channels):
                 for column in range(2):
                     for i in range(count):

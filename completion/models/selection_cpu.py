@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from completion.mixture import surface_shares
-from completion.models.pixel_unet_cpu import PixelUNetKernels
+from completion.models.pixel_unet_cpu import PixelUNetKernels, head_of
 from completion.models.selection import CANDIDATES, CHANNELS, COLUMN_SHIFTS, Selection
-from completion.models.small_product import multiply
 from completion.models.unet_inputs_cpu import RUN, in_threads, unet_inputs
 from completion.models.vector_exp import exp
 from completion.twin_surface import fuse
@@ -172,10 +171,7 @@ def _read_features(first, last, features, kernels, bias, logs, top, shifts, resi
         source, side = (y + top) // 2, (y + top) % 2
         for start in range(0, out.shape[2], RUN):
             count = min(RUN, logs.shape[2] - start) // 2
-            for i in range(count):
-                for c in range(features.shape[2]):
-                    rectified[i, c] = max(features[source, start // 2 + i, c], _ZERO)
-            multiply(rectified[:count], kernels[side], head[:count])
+            head_of(features[source], start // 2, kernels[side], rectified[:count], head[:count])
             for k in range(CANDIDATES):
                 for c in range(2):
                     a, b = 2 * k + c, 2 * (CANDIDATES + k) + c

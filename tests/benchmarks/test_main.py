@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -31,6 +32,7 @@ def test_the_page_begins_with_targets_and_what_got_worse() -> None:
 
 def test_a_baseline_belongs_to_a_kind_of_machine(tmp_path: Path) -> None:
     assert kind_of_machine() == kind_of_machine()
+    assert f", {os.cpu_count()} cores, " in kind_of_machine()
     assert agreement("a Pentium, 1 cores, no AVX", known=False).startswith("No baseline of this kind of machine (a Pen")
     assert read_baselines(tmp_path / "none.json") == {}
     assert all(all(ratio > 0 for ratio in kept.values()) for kept in read_baselines(BASELINE).values())
