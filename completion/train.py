@@ -12,7 +12,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -115,6 +115,18 @@ class TrainSettings:
         return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
 
+@dataclass(frozen=True)
+class TrainProgress:
+    """What a progress callback is told: step (1-based) of steps, mean losses since the last call, seconds per step
+    since the run was started or continued, and the seconds that remain."""
+
+    step: int
+    steps: int
+    losses: dict[str, float]
+    seconds_per_step: float
+    eta_seconds: float
+
+
 def learning_rate(settings: TrainSettings, step: int, steps_per_epoch: int, total: int) -> float:
     """Learning rate of optimiser step `step` (from 0)."""
     rate = settings.learning_rate
@@ -137,6 +149,7 @@ def train(
     validation: Sequence[DepthFrame] = (),
     facts: dict[str, Any] | None = None,
     seconds: float | None = None,
+    progress: Callable[[TrainProgress], None] | None = None,
 ) -> Path:
     """Train, or continue the run in `out`, and return the best checkpoint (the last one without validation frames).
 
@@ -147,6 +160,7 @@ def train(
     validation  frames with target; the diagnostics of each validation are logged
     facts       goes into the cards: data, command, ...
     seconds     stop after about this much time, with the state saved; call again to go on
+    progress    called with every row of log.csv, in the first process
 
     Raises ValueError when settings, samples and the run in `out` do not fit together.
     """
@@ -161,7 +175,10 @@ def train(
         finished = step == run.total or _agreed(seconds is not None and now - begin > seconds, processes)
         validate = bool(settings.validate_every) and step % settings.validate_every == 0
         if step % settings.log_every == 0 or finished:
-            run.log(step)
+            losses = run.log(step)
+            if progress is not None and rank == 0:
+                pace = (now - begin) / (step - run.begun_at)
+                progress(TrainProgress(step, run.total, losses, pace, pace * (run.total - step)))
         if len(validation) and (validate or step == run.total):
             run.validate(step, validation, facts or {})
         if finished or step % settings.checkpoint_steps == 0 or now - last_saved > settings.checkpoint_seconds:
@@ -225,7 +242,9 @@ class _Run:
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=settings.precision == "fp16")
         self.step, self.best = 0, float("inf")
         self.sums: dict[str, float] = {}  # loss parts since the last row of the log
+        self.seconds = 0.0  # of training before this process
         self._resume()
+        self.begun_at, self.begun = self.step, time.monotonic()
         self.forward: nn.Module = self.model
         if processes > 1:
             self.forward = nn.parallel.DistributedDataParallel(self.model)
@@ -237,6 +256,7 @@ class _Run:
             if facts["identity"] != self.settings.identity:
                 raise ValueError(f"{self.out}: holds a run with other settings; give another folder or remove it")
             self.step, self.best, self.sums = facts["step"], facts["best"], facts["sums"]
+            self.seconds = facts.get("seconds", 0.0)
         for name in ("log.csv", "validation.csv"):
             _keep_rows(self.out / name, self.step)
 
@@ -293,7 +313,7 @@ class _Run:
             step / self.planned,
         )
 
-    def log(self, step: int) -> None:
+    def log(self, step: int) -> dict[str, float]:
         """A row of log.csv, and TensorBoard scalars: means since the last row, of the first process' samples."""
         steps = self.sums.pop("steps")
         parts = {name: value / steps for name, value in self.sums.items()}
@@ -303,6 +323,7 @@ class _Run:
         if self.rank == 0:
             _append(self.out / "log.csv", {"step": step} | parts)
             _tensorboard(self.out, step, parts)
+        return parts
 
     def validate(self, step: int, validation: Sequence[DepthFrame], facts: dict[str, Any]) -> None:
         """Diagnose on the validation frames, log, and keep the best checkpoint."""
@@ -322,8 +343,19 @@ class _Run:
         if self.rank != 0:
             return
         save_checkpoint(self.out / "last", self.model, self._card(step, facts))
-        state = {"step": step, "best": self.best, "sums": self.sums, "identity": self.settings.identity}
+        state = {
+            "step": step,
+            "best": self.best,
+            "sums": self.sums,
+            "seconds": self.spent,
+            "identity": self.settings.identity,
+        }
         save_state(self.out / "state.safetensors", self.model, self.optimiser, self.scaler, state)
+
+    @property
+    def spent(self) -> float:
+        """Seconds of training so far, over all processes that continued the run; lost steps do not count."""
+        return self.seconds + time.monotonic() - self.begun
 
     @property
     def read_out(self) -> str:
@@ -333,7 +365,12 @@ class _Run:
         return NetworkCompleter(self.model, self.settings.model, self.device, self.read_out)
 
     def _card(self, step: int, facts: dict[str, Any]) -> Card:
-        described = {"step": step, "settings": asdict(self.settings), "torch": torch.__version__}
+        described = {
+            "step": step,
+            "hours": round(self.spent / 3600, 3),
+            "settings": asdict(self.settings),
+            "torch": torch.__version__,
+        }
         return Card(self.settings.model, self.read_out, described | facts)
 
 

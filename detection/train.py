@@ -248,6 +248,12 @@ class Trainer:
         self.scenes = Scenes(samples, self.preset, settings.cache_mb)
         self.database = object_database(samples, self.preset, settings)
         self.epoch_steps = max(1, len(samples) // (settings.batch_size * self.workers.count))
+        self.seconds, self.begun = 0.0, time.perf_counter()  # of training before this process; start of this one
+
+    @property
+    def spent(self) -> float:
+        """Seconds of training so far, over all processes that continued the run; lost steps do not count."""
+        return self.seconds + time.perf_counter() - self.begun
 
     def batch(self, step: int) -> PointBatch:
         """The frames of a step, prepared with the step's own random numbers."""
@@ -281,7 +287,8 @@ class Trainer:
         """The complete state after `done` steps, atomically."""
         tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
         tensors |= {f"adam.{name}": value for name, value in self.optimiser.state_tensors().items()}
-        save_tensors(path, tensors, {"done": str(done), "settings": _settings_text(self.settings, self.workers.count)})
+        settings = _settings_text(self.settings, self.workers.count)
+        save_tensors(path, tensors, {"done": str(done), "seconds": f"{self.spent:.1f}", "settings": settings})
 
     def resume(self, path: Path) -> int:
         """Load the state if there is one; returns the steps done. Raises ValueError for the state of another run."""
@@ -296,6 +303,7 @@ class Trainer:
 
         self.model.load_state_dict(under("model."))
         self.optimiser.load_state_tensors(under("adam."))
+        self.seconds = float(metadata.get("seconds", 0))
         return int(metadata["done"])
 
 
@@ -354,6 +362,7 @@ def train(
         "steps": settings.steps,
         "seed": settings.seed,
         "frames": len(samples),
+        "hours": round(trainer.spent / 3600, 3),
         "training": json.loads(_settings_text(settings, trainer.workers.count)),
         "versions": {"torch": torch.__version__, "numpy": np.__version__},
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from pipeline.errors import DataError, UsageError
 from pipeline.frame_files import FrameFiles
 from pipeline.paths import RunFolder
 from pipeline.row_drawing import RowDrawing
+from pipeline.runner.progress import duration
 from pipeline.settings import plain, with_changes
 from pipeline.stages import cloud_of, open_frames
 from pipeline.versions import made_with
@@ -128,7 +129,8 @@ def train_completion(config: Config, dataset: Dataset, out: Path) -> Path:
     count = len(dataset) - held_back
     samples = DepthSamples(dataset.select(dataset.ids[:count]), config.train.row_steps, config.train.calibration_jitter)
     validation = [_validation_frame(dataset[frame_id], config) for frame_id in dataset.ids[count:]]
-    return train(settings, samples, out, validation=validation, facts=training_facts(config))
+    facts = training_facts(config)
+    return train(settings, samples, out, validation=validation, facts=facts, progress=print_progress)
 
 
 def _validation_frame(frame: Frame, config: Config) -> DepthFrame:
@@ -144,12 +146,7 @@ def train_detection(config: Config, samples: LabelledFrames, out: Path) -> Path:
     from detection.train import TrainSettings, train
 
     settings = with_changes(TrainSettings(seed=config.seed), config.train.library, "train")
-
-    def report(progress: Any) -> None:
-        losses = "  ".join(f"{name} {value:.3f}" for name, value in progress.losses.items())
-        print(f"step {progress.step} of {progress.steps}  {losses}", flush=True)
-
-    return train(settings, samples, out, config.detection.device, report)
+    return train(settings, samples, out, config.detection.device, print_progress)
 
 
 def train_segmentation(config: Config, dataset: Dataset, out: Path) -> Path:
@@ -159,13 +156,29 @@ def train_segmentation(config: Config, dataset: Dataset, out: Path) -> Path:
     if not dataset[0].has("semantics"):
         raise UsageError(f"{dataset.root}: frame {dataset.ids[0]} has no class map to train segmentation on")
     settings = with_changes(SegmentationSettings(seed=config.seed), config.train.library, "train")
-
-    def report(step: int, loss: float) -> None:
-        print(f"step {step} of {settings.steps}  loss {loss:.3f}", flush=True)
-
     out.mkdir(parents=True, exist_ok=True)
     samples: Any = MaskSamples(dataset)
-    return train_segmenter(samples, out / "model", settings, report)
+    return train_segmenter(samples, out / "model", settings, print_progress)
+
+
+class Progress(Protocol):
+    """What the training loops tell of a run."""
+
+    @property
+    def step(self) -> int: ...
+    @property
+    def steps(self) -> int: ...
+    @property
+    def losses(self) -> dict[str, float]: ...
+    @property
+    def eta_seconds(self) -> float: ...
+
+
+def print_progress(progress: Progress) -> None:
+    """A line with the losses and the time that is left."""
+    losses = "  ".join(f"{name} {value:.3g}" for name, value in progress.losses.items())
+    left = f"  about {duration(progress.eta_seconds)} left" if progress.step < progress.steps else ""
+    print(f"step {progress.step} of {progress.steps}  {losses}{left}", flush=True)
 
 
 def training_facts(config: Config) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,9 +16,14 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from completion.resume import load_state, save_state
 from completion.samples import Augmentation, disturb_image
+from completion.train import TrainProgress
+from pipeline.runner.atomic import write_text
 from pipeline.semantics.conventions import CLASSES, NONE
 from pipeline.semantics.network import LabelledImage, StreetSegmenter, image_tensor, save_segmenter
+
+LOG_EVERY = 50
 
 
 @dataclass(frozen=True)
@@ -45,36 +52,97 @@ def train_segmenter(
     samples: Sequence[LabelledImage],
     out: Path,
     settings: SegmentationSettings,
-    progress: Callable[[int, float], None] | None = None,
+    progress: Callable[[TrainProgress], None] | None = None,
 ) -> Path:
     """Train on random crops by cross-entropy and write OUT.safetensors with its card OUT.json; returns the weights.
 
     Rare classes count more (inverse square root of their frequency in the first 50 samples). AdamW with one cosine
-    cycle. `progress(step, loss)` is called every 50 steps. The same arguments give the same weights on one machine.
+    cycle. The same arguments give the same weights on one machine, also when the run was killed and started again: the
+    folder of OUT also holds state.safetensors and log.csv, written every 50 steps, when `progress` is called too.
+
+    Raises ValueError without samples or steps, and for a state of other settings.
     """
-    steps = settings.steps
-    if not len(samples) or steps < 1:
-        raise ValueError(f"segmentation training: expected samples and steps, got {len(samples)} and {steps}")
-    torch.manual_seed(settings.seed)
-    random = np.random.default_rng(settings.seed)
-    model = StreetSegmenter().train()
-    optimiser = torch.optim.AdamW(model.parameters(), lr=settings.rate, weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, settings.rate, total_steps=steps)
-    weights = _class_weights(samples)
-    losses = []
-    for step in range(steps):
-        images, labels = _crops(samples, settings, random)
-        logits = F.interpolate(model(images), size=settings.crop, mode="bilinear", align_corners=False)
-        loss = F.cross_entropy(logits, labels, weight=weights, ignore_index=NONE)
-        optimiser.zero_grad()
+    if not len(samples) or settings.steps < 1:
+        raise ValueError(f"segmentation training: expected samples and steps, got {len(samples)} and {settings.steps}")
+    run = _Run(samples, settings, out.parent)
+    begun_at, begun = run.step, time.monotonic()
+    while run.step < settings.steps:
+        run.optimise()
+        if run.step % LOG_EVERY == 0 or run.step == settings.steps:
+            loss = run.save()
+            if progress is not None:
+                pace = (time.monotonic() - begun) / (run.step - begun_at)
+                left = pace * (settings.steps - run.step)
+                progress(TrainProgress(run.step, settings.steps, {"loss": loss}, pace, left))
+    training = asdict(settings) | {"samples": len(samples), "final_loss": run.log[-1][1]}
+    return save_segmenter(run.model.eval(), out, training | {"hours": round(run.seconds / 3600, 3)})
+
+
+class _Run:
+    """Network, optimiser, random numbers and files of one training."""
+
+    def __init__(self, samples: Sequence[LabelledImage], settings: SegmentationSettings, folder: Path) -> None:
+        self.samples, self.settings, self.folder = samples, settings, folder
+        torch.manual_seed(settings.seed)
+        self.random = np.random.default_rng(settings.seed)
+        self.model = StreetSegmenter().train()
+        self.optimiser = torch.optim.AdamW(self.model.parameters(), lr=settings.rate, weight_decay=1e-4)
+        self.schedule = torch.optim.lr_scheduler.OneCycleLR(self.optimiser, settings.rate, total_steps=settings.steps)
+        self.weights = _class_weights(samples)
+        self.step, self.seconds = 0, 0.0
+        self.losses: list[float] = []  # since the last row of the log
+        self.log: list[tuple[int, float]] = []
+        self.scaler = torch.amp.GradScaler("cpu", enabled=False)  # part of a state's format
+        self._resume()
+
+    def optimise(self) -> None:
+        """One update."""
+        begun = time.monotonic()
+        images, labels = _crops(self.samples, self.settings, self.random)
+        logits = F.interpolate(self.model(images), size=self.settings.crop, mode="bilinear", align_corners=False)
+        loss = F.cross_entropy(logits, labels, weight=self.weights, ignore_index=NONE)
+        self.optimiser.zero_grad()
         loss.backward()
-        optimiser.step()
-        schedule.step()
-        losses.append(float(loss.detach()))
-        if progress is not None and (step % 50 == 49 or step == steps - 1):
-            progress(step + 1, float(np.mean(losses[-50:])))
-    training = asdict(settings) | {"samples": len(samples), "final_loss": float(np.mean(losses[-50:]))}
-    return save_segmenter(model.eval(), out, training)
+        self.optimiser.step()
+        self.schedule.step()
+        self.losses.append(float(loss.detach()))
+        self.step += 1
+        self.seconds += time.monotonic() - begun
+
+    def save(self) -> float:
+        """A row of the log, then the state; returns the mean loss since the last row."""
+        self.log.append((self.step, float(np.mean(self.losses))))
+        self.losses = []
+        write_text(self.folder / "log.csv", "".join(f"{a},{b}\n" for a, b in [("step", "loss"), *self.log]))
+        facts = {
+            "identity": self._identity,
+            "step": self.step,
+            "seconds": self.seconds,
+            "log": self.log,
+            "random": self.random.bit_generator.state,
+            "groups": [{"lr": group["lr"], "betas": group["betas"]} for group in self.optimiser.param_groups],
+        }
+        save_state(self.folder / "state.safetensors", self.model, self.optimiser, self.scaler, facts)
+        return self.log[-1][1]
+
+    def _resume(self) -> None:
+        path = self.folder / "state.safetensors"
+        if not path.is_file():
+            return
+        facts = load_state(path, self.model, self.optimiser, self.scaler)
+        if facts["identity"] != self._identity:
+            raise ValueError(f"{path}: the state of a run with other settings; use another output folder or remove it")
+        self.step, self.seconds = facts["step"], facts["seconds"]
+        self.log = [(step, loss) for step, loss in facts["log"]]
+        self.random.bit_generator.state = facts["random"]
+        self.schedule.last_epoch = self.step
+        for group, values in zip(self.optimiser.param_groups, facts["groups"]):
+            group |= {"lr": values["lr"], "betas": tuple(values["betas"])}
+
+    @property
+    def _identity(self) -> str:
+        """What must agree for a run to be continued."""
+        return json.dumps(asdict(self.settings) | {"samples": len(self.samples)}, sort_keys=True)
 
 
 def _class_weights(samples: Sequence[LabelledImage]) -> Tensor:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from completion.models import build_model, default_spec, with_rgb
 from completion.models.classical import ClassicalCompleter
 from completion.objectives import Objective, pixel_weights, training_loss
 from completion.samples import Augmentation, StepBatches, disturb_image, draw_crop
-from completion.train import TrainSettings, learning_rate, scales_at, train
+from completion.train import TrainProgress, TrainSettings, learning_rate, scales_at, train
 from completion.types import CompletedDepth, DepthFrame
 from tests.completion.scenes import Streets, street
 from tests.completion.training_run import settings
@@ -68,6 +69,23 @@ def test_stopping_by_time_and_going_on(tmp_path: Path) -> None:
     assert load_checkpoint(last)[1].training["step"] == 5
     at_once = train(whole, Streets(11, 64, 96), tmp_path / "other")
     assert last.read_bytes() == at_once.read_bytes()
+
+
+def test_progress_and_hours_of_a_continued_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock that moves on by an hour whenever it is asked."""
+    asked = iter(range(1000))
+    monkeypatch.setattr("completion.train.time", SimpleNamespace(monotonic=lambda: 3600.0 * next(asked)))
+    whole = replace(settings("selection"), max_steps=5, validate_every=0)
+    told: list[TrainProgress] = []
+    hours = []
+    for seconds in (0.0, None):
+        weights = train(whole, Streets(11, 64, 96), tmp_path, seconds=seconds, progress=told.append)
+        hours.append(load_checkpoint(weights)[1].training["hours"])
+    assert [(each.step, each.steps) for each in told] == [(1, 5), (2, 5), (4, 5), (5, 5)]
+    assert [each.eta_seconds for each in told] == [(5 - each.step) * each.seconds_per_step for each in told]
+    assert told[1].seconds_per_step >= 3600
+    assert hours[0] >= 2
+    assert hours[1] >= hours[0] + 4  # at least the four steps of the second part
 
 
 def test_a_run_goes_on_only_under_its_own_settings(tmp_path: Path) -> None:

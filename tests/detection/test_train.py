@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from detection.augment import PasteSettings
-from detection.checkpoints import load_checkpoint, load_tensors
+from detection.checkpoints import load_checkpoint, load_tensors, save_tensors
 from detection.kitti_format import KittiObject
 from detection.optimiser import OneCycleSettings
 from detection.train import Trainer, TrainProgress, TrainSettings, frame_order, train
@@ -79,6 +79,17 @@ def test_finished_training_can_be_asked_for_again(tmp_path) -> None:
     frames = BoxFrames(2, cars=2)
     first = train(settings(steps=2), frames, tmp_path).read_bytes()
     assert train(settings(steps=2), frames, tmp_path).read_bytes() == first
+
+
+def test_hours_count_what_was_trained_before(tmp_path) -> None:
+    frames = BoxFrames(2, cars=2)
+    train(settings(steps=2), frames, tmp_path)
+    state = tmp_path / "state.safetensors"
+    tensors, facts = load_tensors(state)
+    assert float(facts["seconds"]) > 0
+    save_tensors(state, tensors, {**facts, "seconds": "7200"})
+    train(settings(steps=2), frames, tmp_path)
+    assert 2 <= json.loads((tmp_path / "model.json").read_text())["hours"] < 2.1
 
 
 RUN = """
