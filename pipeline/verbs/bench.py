@@ -1,4 +1,4 @@
-"""`run_pipeline --stage bench`: accuracy on real frames without depth ground truth."""
+"""`run_pipeline --stage bench`: accuracy on real frames without depth ground truth and masks."""
 
 from __future__ import annotations
 
@@ -24,12 +24,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     parser.epilog = EXAMPLES
     add = parser.add_argument
-    add("--suite", choices=("real",), default="real", help="real: held-out LiDAR rings and cars on KITTI frames")
+    add("--suite", choices=("real",), default="real", help="real: held-out LiDAR rings, cars and masks on KITTI frames")
     add("--data", required=True, metavar="DIR", help="KITTI object folder (training/velodyne, image_2, calib, label_2)")
     add("--frames", metavar="FILE|a:b|ids", help="split file, positions, or ids separated by commas")
     add("--rows", default="32,16,8", metavar="N,N", help="LiDAR rows given to completion (default: 32,16,8)")
     add("--completers", metavar="NAME,NAME", help="methods (default: peers, classical and all embedded networks)")
     add("--detectors", metavar="NAME,NAME", help="detectors (default: all embedded); '' for none")
+    add(
+        "--masks",
+        metavar="NAME,NAME",
+        default="network,boxes",
+        help="mask sources (default: network,boxes); '' for none",
+    )
     add("--threshold", type=float, metavar="S", help="lowest score that counts (default: the one in the card)")
     add("--out", metavar="DIR", help="also write real.json and real.md there")
     add("--json", action="store_true", help="print JSON instead of tables")
@@ -37,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measures and prints; 0 when done."""
+    from pipeline.benchmark.mask_points import mask_scores
     from pipeline.benchmark.suite import completion_scores, detection_scores, row_numbers
     from pipeline.data import open_dataset
 
@@ -57,6 +64,8 @@ def run(args: argparse.Namespace) -> int:
     if detectors:
         best = [name for name in names if name not in ("nearest", "linear_inverse", "classical")] or ["classical"]
         found["detection"] = detection_scores(dataset, detectors, best[-1], progress)
+    if args.masks:
+        found["masks"] = mask_scores(dataset, args.masks.split(","), progress)
     tables = _tables(found)
     print(json.dumps(found, indent=1) if args.json else tables)
     if args.out:
@@ -92,7 +101,14 @@ def _detection_rows(chosen: str | None, threshold: float | None) -> list[Any]:
 
 
 def _tables(found: dict[str, Any]) -> str:
-    """Both results as Markdown."""
+    """All results as Markdown."""
+    lines = _completion_table(found)
+    lines += _detection_table(found) if "detection" in found else []
+    lines += _mask_table(found) if "masks" in found else []
+    return "\n".join(lines) + "\n"
+
+
+def _completion_table(found: dict[str, Any]) -> list[str]:
     lines = [f"Completion on held-out rings, {found['frames']} frames (mm; %; s per frame)", ""]
     lines += ["| rows | method | " + " | ".join(COLUMNS) + " |", "|" + "---|" * (len(COLUMNS) + 2)]
     for entry in sorted(found["completion"], key=lambda e: -e["rows"]):
@@ -101,22 +117,31 @@ def _tables(found: dict[str, Any]) -> str:
             for key in COLUMNS
         ]
         lines.append(f"| {entry['rows']} | {entry['method']} | " + " | ".join(numbers) + " |")
-    if "detection" in found:
-        lines += ["", f"Cars found, {found['frames']} frames (found/labelled; precision)", ""]
-        lines += [
-            "| detector | cloud | rows | overlap | easy | moderate | hard | precision | false |",
-            "|" + "---|" * 9,
-        ]
-        for entry in found["detection"]:
-            for report in entry["reports"]:
-                counts = [f"{hit}/{total}" for hit, total in report["found"].values()]
-                lines.append(
-                    f"| {entry['detector']} | {entry['preset']} | {entry['rows']} | "
-                    f"{report['metric']} {report['iou']:g} | "
-                    + " | ".join(counts)
-                    + f" | {_number(report['precision'], 2)} | {report['false']} |"
-                )
-    return "\n".join(lines) + "\n"
+    return lines
+
+
+def _detection_table(found: dict[str, Any]) -> list[str]:
+    lines = ["", f"Cars found, {found['frames']} frames (found/labelled; precision)", ""]
+    lines += ["| detector | cloud | rows | overlap | easy | moderate | hard | precision | false |", "|" + "---|" * 9]
+    for entry in found["detection"]:
+        for report in entry["reports"]:
+            counts = [f"{hit}/{total}" for hit, total in report["found"].values()]
+            lines.append(
+                f"| {entry['detector']} | {entry['preset']} | {entry['rows']} | "
+                f"{report['metric']} {report['iou']:g} | "
+                + " | ".join(counts)
+                + f" | {_number(report['precision'], 2)} | {report['false']} |"
+            )
+    return lines
+
+
+def _mask_table(found: dict[str, Any]) -> list[str]:
+    lines = ["", f"LiDAR points under masks, {found['frames']} frames (against the points in labelled 3D boxes)", ""]
+    lines += ["| mask | group | points in boxes | recall | precision | IoU |", "|" + "---|" * 6]
+    for entry in found["masks"]:
+        shares = " | ".join(_number(entry[key], 2) for key in ("recall", "precision", "iou"))
+        lines.append(f"| {entry['mask']} | {entry['group']} | {entry['boxed']} | {shares} |")
+    return lines
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -1,0 +1,99 @@
+"""Masks on real frames without label maps: do the LiDAR points under a mask lie in the labelled 3D boxes?
+
+KITTI's object frames have boxes and no masks. A box holds little but its object, so its points say where the object's
+pixels are. A mask that leaks over an object's outline calls points of the background behind it vehicles, which is just
+what harms an augmented cloud.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detection.kitti_format import KittiObject, boxes_of
+from detection.ops.pooling import points_in_boxes
+from pipeline.benchmark.visibility import visible_points
+from pipeline.data import Dataset, Frame
+from pipeline.semantics.sources import open_semantics
+from pipeline.simulation.lidar_rows import split_rings
+
+Mask = NDArray[np.bool_]
+
+# What is compared -> KITTI's types of box, Cityscapes trainIds.
+GROUPS = {
+    "vehicles": (("Car", "Van", "Truck", "Tram"), (13, 14, 15, 16)),
+    "people": (("Pedestrian", "Person_sitting", "Cyclist"), (11, 12, 17, 18)),
+}
+# A box reaches down to the road, whose points in it are not the object's. Metres.
+ABOVE_ROAD = 0.2
+
+
+@dataclass(frozen=True)
+class PointCounts:
+    """LiDAR points in a mask and a box, in the mask, in a box."""
+
+    both: int = 0
+    masked: int = 0
+    boxed: int = 0
+
+    def __add__(self, other: PointCounts) -> PointCounts:
+        return PointCounts(self.both + other.both, self.masked + other.masked, self.boxed + other.boxed)
+
+    @property
+    def shares(self) -> dict[str, float | None]:
+        """Recall, precision, and intersection over union; None of nothing."""
+        either = self.masked + self.boxed - self.both
+        wholes = {"recall": self.boxed, "precision": self.masked, "iou": either}
+        return {name: self.both / whole if whole else None for name, whole in wholes.items()}
+
+
+def mask_scores(dataset: Dataset, sources: Iterable[str], progress: Callable[[str], None]) -> list[dict[str, Any]]:
+    """Counts and shares over all frames, an entry per source (as `augment.semantics` names it) and group."""
+    found = []
+    for source in sources:
+        masks = open_semantics(source)
+        sums = dict.fromkeys(GROUPS, PointCounts())
+        for frame in dataset:
+            for group, counts in count_points(frame, masks.semantics(frame)).items():
+                sums[group] += counts
+            progress(f"mask {source} {frame.id}")
+        found += [{"mask": source, "group": group, **vars(sums[group]), **sums[group].shares} for group in GROUPS]
+    return found
+
+
+def count_points(frame: Frame, semantics: NDArray[np.uint8]) -> dict[str, PointCounts]:
+    """Counts of a frame with labels, by group.
+
+    Only returns that the camera sees count, and none in a DontCare region or in the lowest 0.2 m of a box.
+    """
+    points = frame.points
+    seen = points[visible_points(points, split_rings(points), frame.calibration, frame.image_size)]
+    camera = frame.calibration.velo_to_cam(seen)
+    column, row = np.rint(frame.calibration.cam_to_image(camera)[0]).astype(int).T
+    classes, left_out = semantics[row, column], _in_regions(column, row, frame.labels)
+    counts = {}
+    for group, (types, train_ids) in GROUPS.items():
+        boxes = boxes_of(item for item in frame.labels if item.type in types).values
+        inside = points_in_boxes(camera, boxes).any(axis=0)
+        boxes[:, 1] -= ABOVE_ROAD
+        boxes[:, 3] -= ABOVE_ROAD
+        boxed = points_in_boxes(camera, boxes).any(axis=0)
+        counted = ~left_out & ~(inside & ~boxed)
+        masked = np.isin(classes, train_ids) & counted
+        boxed &= counted
+        counts[group] = PointCounts(int((masked & boxed).sum()), int(masked.sum()), int(boxed.sum()))
+    return counts
+
+
+def _in_regions(column: NDArray[np.int_], row: NDArray[np.int_], labels: list[KittiObject]) -> Mask:
+    """(N,) True for pixels in a DontCare region."""
+    inside = np.zeros(len(column), dtype=bool)
+    for item in labels:
+        if item.type == "DontCare":
+            left, top, right, bottom = item.bbox
+            inside |= (column >= left) & (column <= right) & (row >= top) & (row <= bottom)
+    return inside
