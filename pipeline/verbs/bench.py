@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--data", required=True, metavar="DIR", help="KITTI object folder (training/velodyne, image_2, calib, label_2)")
     add("--frames", metavar="FILE|a:b|ids", help="split file, positions, or ids separated by commas")
     add("--rows", default="32,16,8", metavar="N,N", help="LiDAR rows given to completion (default: 32,16,8)")
-    add("--completers", metavar="NAME,NAME", help="methods (default: peers, classical and all embedded networks)")
+    add("--completers", metavar="NAME,NAME", help="methods (default: peers, classical, all embedded); '' for none")
     add("--detectors", metavar="NAME,NAME", help="detectors (default: all embedded); '' for none")
     add(
         "--masks",
