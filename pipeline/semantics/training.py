@@ -34,6 +34,9 @@ class SegmentationSettings:
     rate          largest learning rate of one cosine cycle
     zoom          crops are enlarged by up to this factor or reduced by its inverse
     jitter, gamma, noise   of colours, as `completion.samples.Augmentation`; grey  share of crops without colour
+    shade         share of crops with dark patches: real shadows are darker than ours, and were taken for cars
+    blur          half of the crops are blurred by up to this deviation, pixels: our roads have more grain than real
+                  ones
     """
 
     steps: int = 3000
@@ -46,6 +49,8 @@ class SegmentationSettings:
     gamma: float = 0.5
     noise: float = 8.0
     grey: float = 0.15
+    shade: float = 0.6
+    blur: float = 1.5
 
 
 def train_segmenter(
@@ -85,7 +90,7 @@ class _Run:
         self.samples, self.settings, self.folder = samples, settings, folder
         torch.manual_seed(settings.seed)
         self.random = np.random.default_rng(settings.seed)
-        self.model = StreetSegmenter().train()
+        self.model = StreetSegmenter().train().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.optimiser = torch.optim.AdamW(self.model.parameters(), lr=settings.rate, weight_decay=1e-4)
         self.schedule = torch.optim.lr_scheduler.OneCycleLR(self.optimiser, settings.rate, total_steps=settings.steps)
         self.weights = _class_weights(samples)
@@ -99,7 +104,9 @@ class _Run:
         """One update."""
         begun = time.monotonic()
         images, labels = _crops(self.samples, self.settings, self.random)
-        logits = F.interpolate(self.model(images), size=self.settings.crop, mode="bilinear", align_corners=False)
+        # At half size, as `NetworkSegmenter` labels: the 19 maps of full size would cost a quarter of the step.
+        labels = labels[:, ::2, ::2]
+        logits = F.interpolate(self.model(images), size=labels.shape[-2:], mode="bilinear", align_corners=False)
         loss = F.cross_entropy(logits, labels, weight=self.weights, ignore_index=NONE)
         self.optimiser.zero_grad()
         loss.backward()
@@ -165,12 +172,12 @@ def _crops(
             sample = samples[int(random.integers(len(samples)))]
             whole, classes = sample.image, sample.semantics
         image, semantics = _crop(whole, classes, settings, random)
-        image = disturb_image(image, colours, random)
+        image = disturb_image(_shaded(image, settings, random), colours, random)
         if random.random() < settings.grey:
             image = np.repeat(image.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
         images.append(image_tensor(image))
         labels.append(torch.from_numpy(np.ascontiguousarray(semantics)).long())
-    return torch.cat(images), torch.stack(labels)
+    return torch.cat(images).contiguous(memory_format=torch.channels_last), torch.stack(labels)
 
 
 def _crop(
@@ -191,6 +198,28 @@ def _crop(
     resized = cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_LINEAR)
     labels = cv2.resize(np.ascontiguousarray(semantics), size, interpolation=cv2.INTER_NEAREST)
     return resized.astype(np.uint8), labels.astype(np.uint8)
+
+
+def _shaded(image: NDArray[np.uint8], settings: SegmentationSettings, random: np.random.Generator) -> NDArray[np.uint8]:
+    """The crop, perhaps blurred, and perhaps dark in one to three patches with soft edges, some of them dappled."""
+    if random.random() < 0.5 and settings.blur:
+        image = cv2.GaussianBlur(image, (0, 0), random.uniform(0.3, max(settings.blur, 0.31))).astype(np.uint8)
+    if random.random() >= settings.shade:
+        return image
+    size = np.array(image.shape[:2])
+    light = np.ones(image.shape[:2], np.float32)
+    for _ in range(int(random.integers(1, 4))):
+        angles = np.sort(random.uniform(0, 2 * np.pi, int(random.integers(3, 9))))
+        reach = random.uniform(0.1, 0.7, (len(angles), 1)) * size
+        corners = random.uniform(0, 1, 2) * size + reach * np.column_stack([np.sin(angles), np.cos(angles)])
+        patch = np.zeros(image.shape[:2], np.float32)
+        cv2.fillPoly(patch, [np.rint(corners[:, ::-1]).astype(np.int32)], 1.0)
+        if random.random() < 0.3:
+            leaves = random.random(np.maximum(1, size // int(random.integers(4, 17)))).astype(np.float32)
+            patch *= cv2.resize(leaves, (image.shape[1], image.shape[0])) > 0.5
+        patch = cv2.GaussianBlur(patch, (0, 0), random.uniform(0.5, 4))
+        light *= 1 - patch * random.uniform(0.3, 0.9)
+    return (image * light[..., None]).astype(np.uint8)
 
 
 def _padded(values: NDArray[Any], crop: tuple[int, int], fill: int = 0) -> NDArray[Any]:
