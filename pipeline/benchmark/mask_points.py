@@ -18,6 +18,7 @@ from detection.kitti_format import KittiObject, boxes_of
 from detection.ops.pooling import points_in_boxes
 from pipeline.benchmark.visibility import visible_points
 from pipeline.data import Dataset, Frame
+from pipeline.errors import UsageError
 from pipeline.semantics.sources import open_semantics
 from pipeline.simulation.lidar_rows import split_rings
 
@@ -52,13 +53,19 @@ class PointCounts:
 
 
 def mask_scores(dataset: Dataset, sources: Iterable[str], progress: Callable[[str], None]) -> list[dict[str, Any]]:
-    """Counts and shares over all frames, an entry per source (as `augment.semantics` names it) and group."""
+    """Counts and shares over all frames, an entry per source (as `augment.semantics` names it) and group.
+
+    Raises UsageError for a source of scores ("soft"), which do not tell vehicles from people.
+    """
     found = []
     for source in sources:
         masks = open_semantics(source)
         sums = dict.fromkeys(GROUPS, PointCounts())
         for frame in dataset:
-            for group, counts in count_points(frame, masks.semantics(frame)).items():
+            semantics = masks.semantics(frame)
+            if semantics.dtype != np.uint8:
+                raise UsageError(f"mask {source!r}: expected a source of labels, not of scores")
+            for group, counts in count_points(frame, semantics.astype(np.uint8, copy=False)).items():
                 sums[group] += counts
             progress(f"mask {source} {frame.id}")
         found += [{"mask": source, "group": group, **vars(sums[group]), **sums[group].shares} for group in GROUPS]

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UsageError
+from pipeline.runner.atomic import write_text
 
 COLUMNS = ("mae", "rmse", "tmae", "trmse", "mixed", "mixed_all", "edge_tmae", "missing", "seconds")
 
@@ -60,19 +61,22 @@ def run(args: argparse.Namespace) -> int:
 
     names = _completers(args.completers)
     found: dict[str, Any] = {"frames": len(dataset), "completion": completion_scores(dataset, names, rows, progress)}
-    detectors = _detection_rows(args.detectors, args.threshold)
+    labelled = all(dataset[frame_id].has("labels") for frame_id in dataset.ids)
+    if not labelled:
+        progress("not every frame has labels: cars and masks are not measured")
+    detectors = _detection_rows(args.detectors, args.threshold) if labelled else []
     if detectors:
         best = [name for name in names if name not in ("nearest", "linear_inverse", "classical")] or ["classical"]
         found["detection"] = detection_scores(dataset, detectors, best[-1], progress)
-    if args.masks:
+    if args.masks and labelled:
         found["masks"] = mask_scores(dataset, args.masks.split(","), progress)
     tables = _tables(found)
     print(json.dumps(found, indent=1) if args.json else tables)
     if args.out:
         folder = Path(args.out)
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "real.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
-        (folder / "real.md").write_text(tables, encoding="utf-8")
+        write_text(folder / "real.json", json.dumps(found, indent=1))
+        write_text(folder / "real.md", tables)
     return 0
 
 
@@ -102,10 +106,8 @@ def _detection_rows(chosen: str | None, threshold: float | None) -> list[Any]:
 
 def _tables(found: dict[str, Any]) -> str:
     """All results as Markdown."""
-    lines = _completion_table(found)
-    lines += _detection_table(found) if "detection" in found else []
-    lines += _mask_table(found) if "masks" in found else []
-    return "\n".join(lines) + "\n"
+    tables = {"completion": _completion_table, "detection": _detection_table, "masks": _mask_table}
+    return "\n\n".join("\n".join(table(found)) for name, table in tables.items() if found.get(name)) + "\n"
 
 
 def _completion_table(found: dict[str, Any]) -> list[str]:
@@ -121,7 +123,7 @@ def _completion_table(found: dict[str, Any]) -> list[str]:
 
 
 def _detection_table(found: dict[str, Any]) -> list[str]:
-    lines = ["", f"Cars found, {found['frames']} frames (found/labelled; precision)", ""]
+    lines = [f"Cars found, {found['frames']} frames (found/labelled; precision)", ""]
     lines += ["| detector | cloud | rows | overlap | easy | moderate | hard | precision | false |", "|" + "---|" * 9]
     for entry in found["detection"]:
         for report in entry["reports"]:
@@ -136,7 +138,7 @@ def _detection_table(found: dict[str, Any]) -> list[str]:
 
 
 def _mask_table(found: dict[str, Any]) -> list[str]:
-    lines = ["", f"LiDAR points under masks, {found['frames']} frames (against the points in labelled 3D boxes)", ""]
+    lines = [f"LiDAR points under masks, {found['frames']} frames (against the points in labelled 3D boxes)", ""]
     lines += ["| mask | group | points in boxes | recall | precision | IoU |", "|" + "---|" * 6]
     for entry in found["masks"]:
         shares = " | ".join(_number(entry[key], 2) for key in ("recall", "precision", "iou"))

@@ -13,6 +13,7 @@ from pipeline.benchmark.mask_points import PointCounts, count_points, mask_score
 from pipeline.data import open_dataset
 from pipeline.data.calibration import Calibration
 from pipeline.data.frame import Frame
+from pipeline.errors import UsageError
 from pipeline.simulation.synth import SynthSettings, write_dataset
 
 CAR = KittiObject("Car", 0.0, 0, 0.0, (0, 0, 9, 9), (1.5, 1.6, 4.0), (0.0, 1.5, 10.0), 0.0)
@@ -66,3 +67,9 @@ def test_true_masks_agree_with_boxes_and_filled_boxes_leak(tmp_path: Path) -> No
     assert true["iou"] > 0.8
     assert filled["recall"] > 0.97
     assert filled["precision"] < true["precision"] - 0.1
+
+
+def test_scores_are_no_masks(tmp_path: Path) -> None:
+    write_dataset(tmp_path, SynthSettings(frames=1, seed=5))
+    with pytest.raises(UsageError, match="not of scores"):
+        mask_scores(open_dataset("kitti_object", tmp_path), ["soft"], print)
