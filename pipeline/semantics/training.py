@@ -34,9 +34,6 @@ class SegmentationSettings:
     rate          largest learning rate of one cosine cycle
     zoom          crops are enlarged by up to this factor or reduced by its inverse
     jitter, gamma, noise   of colours, as `completion.samples.Augmentation`; grey  share of crops without colour
-    shade         share of crops with dark patches: real shadows are darker than ours, and were taken for cars
-    blur          half of the crops are blurred by up to this deviation, pixels: our roads have more grain than real
-                  ones
     """
 
     steps: int = 3000
@@ -49,8 +46,6 @@ class SegmentationSettings:
     gamma: float = 0.5
     noise: float = 8.0
     grey: float = 0.15
-    shade: float = 0.6
-    blur: float = 1.5
 
 
 def train_segmenter(
@@ -172,7 +167,7 @@ def _crops(
             sample = samples[int(random.integers(len(samples)))]
             whole, classes = sample.image, sample.semantics
         image, semantics = _crop(whole, classes, settings, random)
-        image = disturb_image(_shaded(image, settings, random), colours, random)
+        image = disturb_image(image, colours, random)
         if random.random() < settings.grey:
             image = np.repeat(image.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
         images.append(image_tensor(image))
@@ -198,28 +193,6 @@ def _crop(
     resized = cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_LINEAR)
     labels = cv2.resize(np.ascontiguousarray(semantics), size, interpolation=cv2.INTER_NEAREST)
     return resized.astype(np.uint8), labels.astype(np.uint8)
-
-
-def _shaded(image: NDArray[np.uint8], settings: SegmentationSettings, random: np.random.Generator) -> NDArray[np.uint8]:
-    """The crop, perhaps blurred, and perhaps dark in one to three patches with soft edges, some of them dappled."""
-    if random.random() < 0.5 and settings.blur:
-        image = cv2.GaussianBlur(image, (0, 0), random.uniform(0.3, max(settings.blur, 0.31))).astype(np.uint8)
-    if random.random() >= settings.shade:
-        return image
-    size = np.array(image.shape[:2])
-    light = np.ones(image.shape[:2], np.float32)
-    for _ in range(int(random.integers(1, 4))):
-        angles = np.sort(random.uniform(0, 2 * np.pi, int(random.integers(3, 9))))
-        reach = random.uniform(0.1, 0.7, (len(angles), 1)) * size
-        corners = random.uniform(0, 1, 2) * size + reach * np.column_stack([np.sin(angles), np.cos(angles)])
-        patch = np.zeros(image.shape[:2], np.float32)
-        cv2.fillPoly(patch, [np.rint(corners[:, ::-1]).astype(np.int32)], 1.0)
-        if random.random() < 0.3:
-            leaves = random.random(np.maximum(1, size // int(random.integers(4, 17)))).astype(np.float32)
-            patch *= cv2.resize(leaves, (image.shape[1], image.shape[0])) > 0.5
-        patch = cv2.GaussianBlur(patch, (0, 0), random.uniform(0.5, 4))
-        light *= 1 - patch * random.uniform(0.3, 0.9)
-    return (image * light[..., None]).astype(np.uint8)
 
 
 def _padded(values: NDArray[Any], crop: tuple[int, int], fill: int = 0) -> NDArray[Any]:

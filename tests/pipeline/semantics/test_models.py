@@ -84,17 +84,6 @@ def test_training_is_repeatable(tmp_path: Path) -> None:
     assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
-def test_shade_darkens_patches_and_nothing_else() -> None:
-    grey = np.full((40, 60, 3), 200, np.uint8)
-    off = SegmentationSettings(shade=0, blur=0)
-    assert np.array_equal(training._shaded(grey, off, np.random.default_rng(0)), grey)
-    shaded = [training._shaded(grey, replace(off, shade=1), np.random.default_rng(seed)) for seed in range(20)]
-    assert all(image.max() <= 200 for image in shaded)
-    dark = np.array([(image < 150).mean() for image in shaded])
-    assert (dark > 0.02).sum() >= 15
-    assert dark.mean() < 0.8
-
-
 class Failing(list[Sample]):
     """Fails when sample number `last` is read."""
 
