@@ -7,7 +7,7 @@ what harms an augmented cloud.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,7 @@ from detection.ops.pooling import points_in_boxes
 from pipeline.benchmark.visibility import visible_points
 from pipeline.data import Dataset, Frame
 from pipeline.errors import UsageError
-from pipeline.semantics.sources import open_semantics
+from pipeline.semantics.sources import SemanticsSource
 from pipeline.simulation.lidar_rows import split_rings
 
 Mask = NDArray[np.bool_]
@@ -52,23 +52,24 @@ class PointCounts:
         return {name: self.both / whole if whole else None for name, whole in wholes.items()}
 
 
-def mask_scores(dataset: Dataset, sources: Iterable[str], progress: Callable[[str], None]) -> list[dict[str, Any]]:
-    """Counts and shares over all frames, an entry per source (as `augment.semantics` names it) and group.
+def mask_scores(
+    dataset: Dataset, sources: Mapping[str, SemanticsSource], progress: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Counts and shares over all frames, an entry per source (by its name) and group.
 
     Raises UsageError for a source of scores ("soft"), which do not tell vehicles from people.
     """
     found = []
-    for source in sources:
-        masks = open_semantics(source)
+    for name, masks in sources.items():
         sums = dict.fromkeys(GROUPS, PointCounts())
         for frame in dataset:
             semantics = masks.semantics(frame)
             if semantics.dtype != np.uint8:
-                raise UsageError(f"mask {source!r}: expected a source of labels, not of scores")
+                raise UsageError(f"mask {name!r}: expected a source of labels, not of scores")
             for group, counts in count_points(frame, semantics.astype(np.uint8, copy=False)).items():
                 sums[group] += counts
-            progress(f"mask {source} {frame.id}")
-        found += [{"mask": source, "group": group, **vars(sums[group]), **sums[group].shares} for group in GROUPS]
+            progress(f"mask {name} {frame.id}")
+        found += [{"mask": name, "group": group, **vars(sums[group]), **sums[group].shares} for group in GROUPS]
     return found
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from pipeline.errors import UsageError
 from pipeline.runner.atomic import write_text
 
+WITHOUT_WEIGHTS = ("nearest", "linear_inverse", "classical")
 COLUMNS = ("mae", "rmse", "tmae", "trmse", "mixed", "mixed_all", "edge_tmae", "missing", "seconds")
 
 
@@ -47,29 +48,31 @@ def run(args: argparse.Namespace) -> int:
     from pipeline.benchmark.mask_points import mask_scores
     from pipeline.benchmark.suite import completion_scores, detection_scores, row_numbers
     from pipeline.data import open_dataset
+    from pipeline.semantics.sources import open_semantics
 
     dataset = open_dataset("kitti_object", args.data)
     if args.frames:
         dataset = dataset.select(args.frames)
-    try:
-        rows = row_numbers(args.rows)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
 
     def progress(text: str) -> None:
         print(f"  {text}", file=sys.stderr)
 
-    names = _completers(args.completers)
-    found: dict[str, Any] = {"frames": len(dataset), "completion": completion_scores(dataset, names, rows, progress)}
+    # Everything is opened before anything is measured: a wrong name should not cost an hour.
+    try:
+        names, rows = _completers(args.completers), row_numbers(args.rows)
+        detectors = _detection_rows(args.detectors, args.threshold)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    masks = {name: open_semantics(name) for name in args.masks.split(",") if name}
     labelled = all(dataset[frame_id].has("labels") for frame_id in dataset.ids)
     if not labelled:
         progress("not every frame has labels: cars and masks are not measured")
-    detectors = _detection_rows(args.detectors, args.threshold) if labelled else []
-    if detectors:
-        best = [name for name in names if name not in ("nearest", "linear_inverse", "classical")] or ["classical"]
+    found: dict[str, Any] = {"frames": len(dataset), "completion": completion_scores(dataset, names, rows, progress)}
+    if detectors and labelled:
+        best = [name for name in names if name not in WITHOUT_WEIGHTS] or ["classical"]
         found["detection"] = detection_scores(dataset, detectors, best[-1], progress)
-    if args.masks and labelled:
-        found["masks"] = mask_scores(dataset, args.masks.split(","), progress)
+    if masks and labelled:
+        found["masks"] = mask_scores(dataset, masks, progress)
     tables = _tables(found)
     print(json.dumps(found, indent=1) if args.json else tables)
     if args.out:
@@ -81,11 +84,17 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _completers(chosen: str | None) -> list[str]:
+    """The methods asked for. Raises ValueError for weights that do not exist."""
+    from completion.checkpoints import find_weights
     from pipeline.weights import embedded_names
 
-    if chosen is not None:
-        return [name for name in chosen.split(",") if name]
-    return ["nearest", "linear_inverse", "classical", *embedded_names("completion")]
+    if chosen is None:
+        return [*WITHOUT_WEIGHTS, *embedded_names("completion")]
+    names = [name for name in chosen.split(",") if name]
+    for name in names:
+        if name not in WITHOUT_WEIGHTS:
+            find_weights(name)
+    return names
 
 
 def _detection_rows(chosen: str | None, threshold: float | None) -> list[Any]:

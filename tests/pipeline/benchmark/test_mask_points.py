@@ -14,6 +14,7 @@ from pipeline.data import open_dataset
 from pipeline.data.calibration import Calibration
 from pipeline.data.frame import Frame
 from pipeline.errors import UsageError
+from pipeline.semantics.sources import open_semantics
 from pipeline.simulation.synth import SynthSettings, write_dataset
 
 CAR = KittiObject("Car", 0.0, 0, 0.0, (0, 0, 9, 9), (1.5, 1.6, 4.0), (0.0, 1.5, 10.0), 0.0)
@@ -60,7 +61,8 @@ def test_points_counted_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_true_masks_agree_with_boxes_and_filled_boxes_leak(tmp_path: Path) -> None:
     write_dataset(tmp_path, SynthSettings(frames=3, seed=5))
     told: list[str] = []
-    found = mask_scores(open_dataset("kitti_object", tmp_path), ["truth", "boxes"], told.append)
+    sources = {name: open_semantics(name) for name in ("truth", "boxes")}
+    found = mask_scores(open_dataset("kitti_object", tmp_path), sources, told.append)
     true, filled = (entry for entry in found if entry["group"] == "vehicles")
     assert (true["mask"], filled["mask"], len(told)) == ("truth", "boxes", 6)
     assert true["boxed"] == filled["boxed"] > 500
@@ -72,4 +74,4 @@ def test_true_masks_agree_with_boxes_and_filled_boxes_leak(tmp_path: Path) -> No
 def test_scores_are_no_masks(tmp_path: Path) -> None:
     write_dataset(tmp_path, SynthSettings(frames=1, seed=5))
     with pytest.raises(UsageError, match="not of scores"):
-        mask_scores(open_dataset("kitti_object", tmp_path), ["soft"], print)
+        mask_scores(open_dataset("kitti_object", tmp_path), {"soft": open_semantics("soft")}, print)

@@ -45,3 +45,16 @@ def test_frames_without_labels(streets: Path, tmp_path: Path, capsys: pytest.Cap
     printed = capsys.readouterr()
     assert set(json.loads(printed.out)) == {"frames", "completion"}
     assert "cars and masks are not measured" in printed.err
+
+
+@pytest.mark.parametrize(
+    ("option", "known"),
+    [("--completers", "selection_small"), ("--detectors", "small_lidar"), ("--masks", "truth, boxes, files:FOLDER")],
+)
+def test_wrong_names_are_told_before_anything_is_measured(
+    option: str, known: str, streets: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*BENCH, "--data", str(streets), option, "nothing"]) == 2
+    printed = capsys.readouterr()
+    assert known in printed.err
+    assert "completion 0" not in printed.err
