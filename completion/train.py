@@ -126,6 +126,12 @@ class TrainProgress:
     seconds_per_step: float
     eta_seconds: float
 
+    @classmethod
+    def after(cls, seconds: float, done: int, step: int, steps: int, losses: dict[str, float]) -> TrainProgress:
+        """At `step`, when `done` steps took so many seconds."""
+        pace = seconds / done
+        return cls(step, steps, losses, pace, pace * (steps - step))
+
 
 def learning_rate(settings: TrainSettings, step: int, steps_per_epoch: int, total: int) -> float:
     """Learning rate of optimiser step `step` (from 0)."""
@@ -166,19 +172,17 @@ def train(
     """
     rank, processes = _join_processes(settings.device)
     run = _Run(settings, samples, Path(out), rank, processes)
-    begin, step = time.monotonic(), run.step
-    last_saved = begin
+    step, last_saved = run.step, run.begun
     for batches in run.batches(step):
         run.optimise(step, batches)
         step += 1
         now = time.monotonic()
-        finished = step == run.total or _agreed(seconds is not None and now - begin > seconds, processes)
+        finished = step == run.total or _agreed(seconds is not None and now - run.begun > seconds, processes)
         validate = bool(settings.validate_every) and step % settings.validate_every == 0
         if step % settings.log_every == 0 or finished:
             losses = run.log(step)
             if progress is not None and rank == 0:
-                pace = (now - begin) / (step - run.begun_at)
-                progress(TrainProgress(step, run.total, losses, pace, pace * (run.total - step)))
+                progress(TrainProgress.after(now - run.begun, step - run.begun_at, step, run.total, losses))
         if len(validation) and (validate or step == run.total):
             run.validate(step, validation, facts or {})
         if finished or step % settings.checkpoint_steps == 0 or now - last_saved > settings.checkpoint_seconds:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,9 +21,11 @@ from pipeline.versions import made_with
 
 if TYPE_CHECKING:
     from completion.samples import TrainingSample
+    from completion.train import TrainProgress as DepthProgress
     from completion.types import DepthFrame
     from detection.kitti_format import KittiObject
     from detection.train import LabelledFrames
+    from detection.train import TrainProgress as DetectionProgress
     from detection.types import PointFrame
 
 
@@ -161,20 +163,7 @@ def train_segmentation(config: Config, dataset: Dataset, out: Path) -> Path:
     return train_segmenter(samples, out / "model", settings, print_progress)
 
 
-class Progress(Protocol):
-    """What the training loops tell of a run."""
-
-    @property
-    def step(self) -> int: ...
-    @property
-    def steps(self) -> int: ...
-    @property
-    def losses(self) -> dict[str, float]: ...
-    @property
-    def eta_seconds(self) -> float: ...
-
-
-def print_progress(progress: Progress) -> None:
+def print_progress(progress: DepthProgress | DetectionProgress) -> None:
     """A line with the losses and the time that is left."""
     losses = "  ".join(f"{name} {value:.3g}" for name, value in progress.losses.items())
     left = f"  about {duration(progress.eta_seconds)} left" if progress.step < progress.steps else ""

@@ -24,6 +24,7 @@ from pipeline.training_clouds import thinned_cloud
 
 Progress = Callable[[str], None]
 IOUS = (0.5, 0.7)
+WITHOUT_WEIGHTS = (*PEERS, "classical")
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,8 @@ def completion_scores(
     names  peers ("nearest", "linear_inverse"), "classical", or weights as `load_completer` takes them
     """
     methods = [(name, _method(name)) for name in names]
+    if not methods:
+        return []
     found: dict[tuple[str, int], list[dict[str, float]]] = {}
     for frame_id in dataset.ids:
         frame = dataset[frame_id]

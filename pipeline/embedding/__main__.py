@@ -15,33 +15,24 @@ from collections.abc import Sequence
 from typing import Any
 
 from pipeline.config import Config, load_config
-from pipeline.embedding.cards import (
-    embedded_path,
-    held_out_of,
-    measured,
-    origin,
-    parser_of,
-    read_card,
-    weights_of,
-    write_card,
-)
+from pipeline.embedding import cards
 from pipeline.synthetic import synth_settings
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line; see the module's text."""
-    parser = parser_of("pipeline.embedding", __doc__)
+    parser = cards.parser_of("pipeline.embedding", __doc__)
     parser.add_argument("--config", required=True, nargs="+", help="what RUN was trained by, and runs it began with")
     parser.add_argument("--limits", required=True, help="what the network is not good at, for its card")
     args = parser.parse_args(argv)
-    source, target = weights_of(args.room, args.run), embedded_path(args.room, args.name)
+    source, target = cards.weights_of(args.room, args.run), cards.embedded_path(args.room, args.name)
     configs = [load_config(path) for path in args.config]
-    card = read_card(source)
-    card |= {"name": args.name, "limits": args.limits, **origin(card), **how_made(args.config, configs)}
-    card |= measured(args.room, source, held_out_of(args))
+    card = cards.read_card(source)
+    card |= {"name": args.name, "limits": args.limits, **cards.origin(card), **how_made(args.config, configs)}
+    card |= cards.measured(args.room, source, cards.held_out_of(args))
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(source, target)
-    write_card(target, card)
+    cards.write_card(target, card)
     print(target)
     return 0
 

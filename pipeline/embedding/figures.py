@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ class HeldOut:
             found = segmentation_figures(weights, self.dataset)
         return {**self.which, **found}
 
-    @property
+    @cached_property
     def which(self) -> dict[str, Any]:
         """How many frames these are, and a hash of their ids and labels that tells them from others."""
         content = [(frame.id, [str(label) for label in frame.labels]) for frame in self.dataset]

@@ -65,15 +65,14 @@ def train_segmenter(
     if not len(samples) or settings.steps < 1:
         raise ValueError(f"segmentation training: expected samples and steps, got {len(samples)} and {settings.steps}")
     run = _Run(samples, settings, out.parent)
-    begun_at, begun = run.step, time.monotonic()
+    begun_at, before = run.step, run.seconds
     while run.step < settings.steps:
         run.optimise()
         if run.step % LOG_EVERY == 0 or run.step == settings.steps:
             loss = run.save()
             if progress is not None:
-                pace = (time.monotonic() - begun) / (run.step - begun_at)
-                left = pace * (settings.steps - run.step)
-                progress(TrainProgress(run.step, settings.steps, {"loss": loss}, pace, left))
+                taken, done = run.seconds - before, run.step - begun_at
+                progress(TrainProgress.after(taken, done, run.step, settings.steps, {"loss": loss}))
     training = asdict(settings) | {"samples": len(samples), "final_loss": run.log[-1][1]}
     return save_segmenter(run.model.eval(), out, training | {"hours": round(run.seconds / 3600, 3)})
 

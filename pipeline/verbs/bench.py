@@ -11,7 +11,6 @@ from typing import Any
 from pipeline.errors import UsageError
 from pipeline.runner.atomic import write_text
 
-WITHOUT_WEIGHTS = ("nearest", "linear_inverse", "classical")
 COLUMNS = ("mae", "rmse", "tmae", "trmse", "mixed", "mixed_all", "edge_tmae", "missing", "seconds")
 
 
@@ -46,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measures and prints; 0 when done."""
     from pipeline.benchmark.mask_points import mask_scores
-    from pipeline.benchmark.suite import completion_scores, detection_scores, row_numbers
+    from pipeline.benchmark.suite import WITHOUT_WEIGHTS, completion_scores, detection_scores, row_numbers
     from pipeline.data import open_dataset
     from pipeline.semantics.sources import open_semantics
 
@@ -86,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
 def _completers(chosen: str | None) -> list[str]:
     """The methods asked for. Raises ValueError for weights that do not exist."""
     from completion.checkpoints import find_weights
+    from pipeline.benchmark.suite import WITHOUT_WEIGHTS
     from pipeline.weights import embedded_names
 
     if chosen is None:
