@@ -20,7 +20,7 @@ import time
 from pathlib import Path
 
 from benchmarks.record import Measure, save
-from pipeline.frame_files import Written
+from pipeline.run_folder.frame_outputs import Written
 from pipeline.runner.jobs import Outcome, Task
 from pipeline.runner.ledger import Ledger
 
@@ -49,7 +49,8 @@ def measured(options: list[str], workers: int, folder: Path, sizes: dict[str, fl
 
 def made_frames(root: Path, frames: int, different: int = 6) -> Path:
     """A KITTI folder of `frames` synthetic frames, `different` of them different."""
-    from pipeline.simulation.synth import SynthSettings, write_dataset
+    from pipeline.simulation.synth import SynthSettings
+    from pipeline.simulation.writers import write_dataset
 
     write_dataset(root, SynthSettings(frames=min(frames, different), seed=7), workers=2)
     for number in range(different, frames):

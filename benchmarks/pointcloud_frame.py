@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from completion.types import CompletedDepth
-from pipeline.data.calibration import Calibration
-from pipeline.pointcloud.backproject import back_project
+from pipeline.geometry.back_project import back_project
+from pipeline.geometry.calibration import Calibration
 from pipeline.pointcloud.range_image import RangeGrid, range_sample
 
 HEIGHT, WIDTH = 375, 1242

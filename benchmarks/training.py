@@ -21,15 +21,15 @@ from benchmarks.batch import made_frames
 from benchmarks.record import Measure, save
 from completion.inputs import scale_rgb
 from completion.models import ModelSpec, build_model, default_spec
-from completion.objectives import Objective, default_kind, training_loss
 from completion.samples import Augmentation, StepBatches
 from completion.train import TrainSettings as DepthSettings
 from completion.train import train as train_depth
+from completion.training_loss import Objective, default_kind, training_loss
 from detection.models import layers
 from detection.train import Trainer, TrainSettings, collate, prepare_sample, training_scene
 from detection.types import PointFrame
 from pipeline.data import Dataset, open_dataset
-from pipeline.training import DepthSamples
+from pipeline.training.stage import DepthSamples
 
 
 class Clouds:

@@ -17,9 +17,9 @@ import torch
 from torch import Tensor, nn
 
 from completion.checkpoints import Card, write_atomically
-from completion.models import hourglass_cpu
+from completion.cpu import hourglass as hourglass_cpu
+from completion.cpu.pixel_unet import PixelUNetKernels
 from completion.models.hourglass import Hourglasses
-from completion.models.pixel_unet_cpu import PixelUNetKernels
 from completion.models.ring_coefficients import RingCoefficients
 from completion.models.selection import CANDIDATES, INPUTS, Selection
 

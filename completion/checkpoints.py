@@ -20,9 +20,9 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import nn
 
+from completion.decoding import default_read_out
 from completion.importers import import_checkpoint, import_with_spec
 from completion.models import ModelSpec, build_model
-from completion.readout import default_read_out
 from completion.state_dicts import CheckpointError, fill, match
 
 __all__ = [

@@ -18,14 +18,14 @@ from torch.nn import functional as F
 
 from completion.backends import BACKENDS, Convolutions, other_than_torch
 from completion.checkpoints import load_checkpoint
+from completion.cpu.pixel_unet import PixelUNetKernels
+from completion.cpu.ring_coefficients import complete_coefficients
+from completion.cpu.selection import complete_mixture
+from completion.decoding import Maps, read_output, require_read_out
 from completion.inputs import scale_rgb
 from completion.models import ModelSpec
 from completion.models.classical import ClassicalCompleter
-from completion.models.pixel_unet_cpu import PixelUNetKernels
-from completion.models.ring_coefficients_cpu import complete_coefficients
 from completion.models.selection import Selection
-from completion.models.selection_cpu import complete_mixture
-from completion.readout import Maps, read_output, require_read_out
 from completion.types import CompletedDepth, DepthFrame, FloatMap
 
 
@@ -42,7 +42,7 @@ class Completer(Protocol):
 class NetworkCompleter:
     """A network with its input scaling, on one device. Any image size: padded at the top and right, cut back after.
 
-    read_out      see `completion.readout`
+    read_out      see `completion.decoding`
     rows          predict the bottom `rows` rows only (published protocols: 352, 256), 0 elsewhere; None: full height
     convolutions  computes the network's convolutions in its place (see `completion.backends`); None: torch does
     """

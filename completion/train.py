@@ -21,15 +21,15 @@ import torch
 from torch import Tensor, nn
 
 from completion.checkpoints import Card, load_checkpoint, save_checkpoint
+from completion.decoding import default_read_out
 from completion.diagnostics import diagnose
 from completion.growth import adopt, grow
 from completion.infer import NetworkCompleter
 from completion.inputs import scale_rgb
 from completion.models import ModelSpec, build_model
-from completion.objectives import Objective, fits, training_loss
-from completion.readout import default_read_out
 from completion.resume import load_state, save_state
 from completion.samples import Augmentation, Batch, SampleSource, StepBatches
+from completion.training_loss import Objective, fits, training_loss
 from completion.types import DepthFrame
 
 PRECISIONS = {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}

@@ -9,17 +9,18 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.config import Config, dump_config, load_config
+from pipeline.base.atomic import remove_leftovers, write_text
+from pipeline.base.errors import UsageError
+from pipeline.base.paths import RunFolder
+from pipeline.base.settings import nearest_name
+from pipeline.base.versions import made_with
 from pipeline.data import Dataset
-from pipeline.errors import UsageError
-from pipeline.paths import RunFolder
-from pipeline.runner.atomic import remove_leftovers, write_text
+from pipeline.run_folder.config import Config, dump_config, load_config
 from pipeline.runner.batch import Batch, StageSummary, open_batch, shard_of
 from pipeline.runner.failures import update_failures
 from pipeline.runner.jobs import Outcome, Task
 from pipeline.runner.processes import available_cores
 from pipeline.runner.signals import StopRequest, stop_on_signals
-from pipeline.settings import nearest_name
 from pipeline.stages import (
     FRAME_STAGES,
     STAGES,
@@ -30,7 +31,6 @@ from pipeline.stages import (
     open_frames,
 )
 from pipeline.summary import print_dry_run, print_results, print_summary, run_record
-from pipeline.versions import made_with
 
 DONE, SOME_FAILED, REFUSED = 0, 1, 2
 
@@ -81,7 +81,7 @@ def carry_out(request: Request, record: dict[str, Any] | None = None) -> int:
     with stop_on_signals() as stop:
         code = run_batch(request, config, run, stage, stop, record)
     if stage == "train" and code == DONE:
-        from pipeline.training import train_stage
+        from pipeline.training.stage import train_stage
 
         record["weights"] = str(train_stage(config, run))
         print(f"weights: {record['weights']}")
@@ -196,7 +196,7 @@ def run_batch(
 
 def score(config: Config, batch: Batch, explicit: bool) -> None:
     """metrics.json and tables.md of the run; frames that cannot be scored go to the ledger."""
-    from pipeline.scoring import evaluate_run
+    from pipeline.scoring.scores import evaluate_run
 
     batch.ledger.forget_failures("evaluate", batch.frames)
     frames = [frame_id for frame_id in batch.frames if frame_id not in batch.failed]

@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import Config
+from pipeline.base.errors import DataError, UsageError
+from pipeline.base.paths import RunFolder
+from pipeline.base.seeds import derive_seed
+from pipeline.base.settings import nearest_name, plain, with_changes
 from pipeline.data import Dataset, Frame, open_dataset
 from pipeline.data.depth_png import read_depth_png
-from pipeline.errors import DataError, UsageError
-from pipeline.frame_files import FrameFiles
-from pipeline.paths import RunFolder
-from pipeline.runner.seeds import derive_seed
-from pipeline.settings import nearest_name, plain, with_changes
-from pipeline.weights import completion_weights, detection_weights, detector_name, mask_weights
+from pipeline.run_folder.config import Config
+from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.run_folder.weights import completion_weights, detection_weights, detector_name, mask_weights
 
 if TYPE_CHECKING:
     from completion.types import CompletedDepth
@@ -106,7 +106,7 @@ def lidar_of(frame: Frame) -> NDArray[np.float32]:
     """(N, 4) LiDAR points; where sparse depth is stored instead (Virtual KITTI 2), its pixels back-projected."""
     if frame.has("points"):
         return frame.points
-    from pipeline.pointcloud.backproject import back_project
+    from pipeline.geometry.back_project import back_project
 
     sparse = frame.sparse_depth
     points = back_project(sparse, frame.calibration, sparse > 0).points
@@ -251,7 +251,7 @@ FRAME_STAGES: dict[str, FrameStage] = {
         _complete_parts,
         lambda config, run, frame_id: (),
         completion_weights,
-        ("completion", "pipeline/data"),
+        ("completion", "pipeline/geometry", "pipeline/data"),
         seconds=3.0,
         megabytes=1.2,
     ),
@@ -261,7 +261,7 @@ FRAME_STAGES: dict[str, FrameStage] = {
         _augment_parts,
         _augment_files,
         _augment_weights,
-        ("pipeline/pointcloud", "pipeline/semantics", "pipeline/data"),
+        ("pipeline/pointcloud", "pipeline/semantics", "pipeline/geometry", "pipeline/data"),
         seconds=0.3,
         megabytes=0.8,
     ),
@@ -271,7 +271,7 @@ FRAME_STAGES: dict[str, FrameStage] = {
         _detect_parts,
         _detect_files,
         detection_weights,
-        ("detection", "pipeline/data"),
+        ("detection", "pipeline/geometry", "pipeline/data"),
         seconds=2.0,
         megabytes=0.01,
     ),

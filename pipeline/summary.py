@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from pipeline.config import Config
-from pipeline.paths import RunFolder
-from pipeline.report.tables import ap_header, ap_rows, depth_rows
+from pipeline.base.paths import RunFolder
+from pipeline.base.progress import duration
+from pipeline.run_folder.config import Config
 from pipeline.runner.batch import StageSummary
-from pipeline.runner.progress import duration
+from pipeline.scoring.tables import ap_header, ap_rows, depth_rows
 
 if TYPE_CHECKING:
     from pipeline.runner.estimate import StageEstimate

@@ -7,13 +7,13 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.config import Config
-from pipeline.errors import UsageError
-from pipeline.runner.atomic import write_text
+from pipeline.base.atomic import write_text
+from pipeline.base.errors import UsageError
+from pipeline.base.progress import progress
+from pipeline.base.settings import plain, with_changes
+from pipeline.run_folder.config import Config
 from pipeline.runner.keys import code_version
 from pipeline.runner.processes import available_cores
-from pipeline.runner.progress import progress
-from pipeline.settings import plain, with_changes
 
 if TYPE_CHECKING:
     from pipeline.simulation.synth import SynthSettings
@@ -44,7 +44,7 @@ def make_synthetic_data(config: Config, root: Path) -> bool:
         raise UsageError(f"{root} holds files that the synth stage did not write; choose another folder with --data")
     if state:
         _remove_older(config, root)
-    from pipeline.simulation.synth import write_dataset
+    from pipeline.simulation.writers import write_dataset
 
     # Written first: after a kill the folder is known to be ours, and the next run makes it complete.
     write_text(marker, json.dumps({**wanted, "complete": False}, indent=1) + "\n")

@@ -16,8 +16,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from pipeline.config import load_config  # noqa: E402
-from pipeline.weights import detector_name, embedded_folder  # noqa: E402
+from pipeline.run_folder.config import load_config  # noqa: E402
+from pipeline.run_folder.weights import detector_name, embedded_folder  # noqa: E402
 
 PAGES = ("README.md", "docs/index.md")
 PLACE = re.compile(r"(<!-- accuracy[^>]*-->\n).*?(<!-- end -->)", re.DOTALL)

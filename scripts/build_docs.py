@@ -31,10 +31,11 @@ API: dict[str, tuple[str, ...]] = {
         "detection.ops", "detection.evaluation.kitti_ap", "detection.train",
     ),
     "pipeline": (
-        "pipeline.data", "pipeline.data.frame", "pipeline.data.calibration", "pipeline.data.projection",
+        "pipeline.data", "pipeline.data.frame", "pipeline.geometry.calibration", "pipeline.geometry.project",
         "pipeline.data.depth_png", "pipeline.pointcloud.augment", "pipeline.pointcloud.presets",
         "pipeline.pointcloud.sigma_filter", "pipeline.pointcloud.grid_sampling", "pipeline.pointcloud.radius_gather",
-        "pipeline.pointcloud.pseudo_sigma", "pipeline.simulation.synth", "pipeline.simulation.noise", "pipeline.config",
+        "pipeline.pointcloud.pseudo_sigma", "pipeline.simulation.synth", "pipeline.simulation.noise",
+        "pipeline.run_folder.config",
     ),
 }  # fmt: skip
 # Room for 95 characters of code at 1280 pixels; options do not break at their hyphens (class `whole`); long lines of

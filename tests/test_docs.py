@@ -16,9 +16,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pipeline.cli import STAGE_HELP, main, main_parser, verb_parser
-from pipeline.config import load_config
+from pipeline.cli import main
+from pipeline.run_folder.config import load_config
 from pipeline.verbs import available_verbs
+from pipeline.verbs.parsers import STAGE_HELP, main_parser, verb_parser
 from tests.pipeline.tiny_kitti import write_tiny_kitti
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from detection.ops.rotated_iou import RESIDUE
+from detection.ops._rounding import RESIDUE
 
 
 def on_device(numpy_function: Callable[..., Any], torch_function: Callable[..., Any], a: Tensor, b: Tensor) -> Tensor:

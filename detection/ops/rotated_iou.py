@@ -18,14 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detection.ops._numba import kernel
+from detection.ops._rounding import RESIDUE
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 Array = NDArray[np.float64]
-
-# Boxes that do not meet leave sums that cancel to a few times 1e-16 of their size; an overlap this small is none.
-RESIDUE = 1.6e-14
 
 
 @kernel

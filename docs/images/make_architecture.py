@@ -99,7 +99,7 @@ def drawing() -> str:
             "failures.json",
         ),
         box(290, 210, 160, 110, blue, "pipeline/data/", "one reader and", "writer per data set", "-> Frame"),
-        box(30, 370, 200, 90, blue, "pipeline/config.py", "the only YAML reader;", "unknown keys refused"),
+        box(30, 370, 200, 90, blue, "pipeline/run_folder/config.py", "the only YAML reader;", "unknown keys refused"),
         box(290, 370, 160, 90, blue, "pipeline/report/", "one HTML page,", "tables.md"),
         arrow(130, 160, 130, 210),
         arrow(365, 210, 365, 160),

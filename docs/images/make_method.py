@@ -17,7 +17,7 @@ from completion.infer import load_completer
 from completion.types import CompletedDepth
 from detection.boxes import corners
 from detection.kitti_format import KittiObject, boxes_of
-from pipeline.data.projection import project_points
+from pipeline.geometry.project import project_points
 from pipeline.pointcloud.augment import AugmentedCloud, augment_frame
 from pipeline.pointcloud.presets import PRESETS
 from pipeline.pointcloud.pseudo_sigma import pseudo_sigma

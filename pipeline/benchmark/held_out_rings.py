@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from pipeline.benchmark.visibility import visible_points
-from pipeline.data.calibration import Calibration
-from pipeline.data.projection import project_points
-from pipeline.simulation.lidar_rows import split_rings
+from pipeline.geometry.calibration import Calibration
+from pipeline.geometry.project import project_points
+from pipeline.geometry.rings import split_rings
 
 Array = NDArray[np.float64]
 

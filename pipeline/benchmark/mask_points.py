@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from detection.kitti_format import KittiObject, boxes_of
 from detection.ops.pooling import points_in_boxes
+from pipeline.base.errors import UsageError
 from pipeline.benchmark.visibility import visible_points
 from pipeline.data import Dataset, Frame
-from pipeline.errors import UsageError
+from pipeline.geometry.rings import split_rings
 from pipeline.semantics.sources import SemanticsSource
-from pipeline.simulation.lidar_rows import split_rings
 
 Mask = NDArray[np.bool_]
 

@@ -20,7 +20,7 @@ from pipeline.benchmark.held_out_rings import ROW_STEPS, hold_out, score
 from pipeline.benchmark.peers import PEERS
 from pipeline.data import Dataset, Frame
 from pipeline.pointcloud.presets import PRESETS
-from pipeline.training_clouds import thinned_cloud
+from pipeline.training.thinned_clouds import thinned_cloud
 
 Progress = Callable[[str], None]
 IOUS = (0.5, 0.7)

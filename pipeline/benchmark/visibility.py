@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
-from pipeline.data.calibration import Calibration
+from pipeline.geometry.calibration import Calibration
 
 Array = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.errors import DataError
 from pipeline.check.faults import Finding
-from pipeline.data.calibration import Calibration, parse_key_values
-from pipeline.errors import DataError
+from pipeline.geometry.calibration import Calibration, parse_key_values
 
 # KITTI's five recording rigs: image size (height, width) of the day -> focal length and principal point of P_rect_02.
 KITTI_RIGS = {

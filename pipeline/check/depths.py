@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.errors import DataError
 from pipeline.check.faults import Finding
-from pipeline.data.calibration import Calibration
 from pipeline.data.images import read_unchanged
-from pipeline.errors import DataError
+from pipeline.geometry.calibration import Calibration
 
 FAR_CODE = 65535
 # Share of the LiDAR pixels where a map is within 10 %: a working network reaches 0.8 and more, random weights 0.1.

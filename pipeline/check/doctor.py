@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from pipeline.base.errors import DataError, UsageError
 from pipeline.check.datasets import examine_dataset
 from pipeline.check.faults import FAULTS, Finding, causes
 from pipeline.check.frames import Place, open_present
@@ -24,7 +25,6 @@ from pipeline.data import READERS
 from pipeline.data.dataset import Dataset
 from pipeline.data.frame import Frame
 from pipeline.data.nyuv2 import open_nyuv2_full
-from pipeline.errors import DataError, UsageError
 from pipeline.export.source import in_run
 from pipeline.export.workers import default_workers, map_ordered
 

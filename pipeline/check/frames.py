@@ -16,17 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detection.kitti_format import KittiObject, boxes_of
+from pipeline.base.errors import DataError
 from pipeline.check.calibrations import calibration_key, check_calibration, check_family
 from pipeline.check.clouds import CloudFacts, check_cloud, cloud_facts, read_raw_cloud
 from pipeline.check.depths import check_depth, file_fault, read_map
 from pipeline.check.faults import Finding
 from pipeline.check.images import CROP_SHIFTS, Structure, colours_swapped, shift_gains, structure
 from pipeline.check.labels import check_objects, read_objects
-from pipeline.data.calibration import Calibration
 from pipeline.data.frame import Frame
-from pipeline.data.projection import project_points
-from pipeline.errors import DataError
 from pipeline.export.geometry import boxes_in_lidar, points_in_box
+from pipeline.geometry.calibration import Calibration
+from pipeline.geometry.project import project_points
 
 Points = NDArray[np.float32]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.calibration import Calibration
+from pipeline.geometry.calibration import Calibration
 
 # Neighbouring frames that are tried when image and cloud do not fit.
 OFFSETS = (-2, -1, 1, 2)

@@ -10,13 +10,13 @@ import numpy as np
 
 from detection.boxes import wrap_angle
 from detection.kitti_format import KittiObject
+from pipeline.base.errors import DataError
 from pipeline.check.faults import Finding
 from pipeline.check.labels import read_objects
 from pipeline.check.safe_pickle import load_infos
-from pipeline.data.calibration import Calibration, read_calibration
-from pipeline.errors import DataError
 from pipeline.export.kitti_tree import square
 from pipeline.export.mmdet3d import CATEGORIES
+from pipeline.geometry.calibration import Calibration, read_calibration
 
 _TOLERANCE = 1e-3
 

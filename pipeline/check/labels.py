@@ -9,7 +9,7 @@ import numpy as np
 from detection.boxes import observation_angle, project_to_image, wrap_angle
 from detection.kitti_format import KittiObject, boxes_of, parse_lines
 from pipeline.check.faults import Finding
-from pipeline.data.calibration import Calibration
+from pipeline.geometry.calibration import Calibration
 
 CLASSES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
 # Longer than wide and higher than long never holds for these.

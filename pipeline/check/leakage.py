@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.errors import DataError, UsageError
+from pipeline.base.errors import DataError, UsageError
 
 _DRIVE = re.compile(r"(\d{4}_\d{2}_\d{2}_drive_\d{4})(?:_sync)?")
 _FRAME = re.compile(r"(\d{10})")

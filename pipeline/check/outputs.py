@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.base.errors import DataError
+from pipeline.base.paths import RunFolder
 from pipeline.check.depths import check_depth, read_map
 from pipeline.check.faults import Finding
 from pipeline.check.frames import Place
 from pipeline.check.labels import check_objects, read_objects
 from pipeline.check.virtual import lidar_map
 from pipeline.data.frame import Frame
-from pipeline.errors import DataError
-from pipeline.paths import RunFolder
 
 _CLOUD_ROW = 20
 

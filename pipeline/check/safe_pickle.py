@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.base.errors import DataError
 from pipeline.data.images import read_bytes
-from pipeline.errors import DataError
 
 
 class _ArraysOnly(pickle.Unpickler):

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.errors import DataError
 from pipeline.check.depths import check_depth, read_map
 from pipeline.check.faults import Finding
 from pipeline.check.frames import Place
-from pipeline.data.calibration import Calibration
 from pipeline.data.frame import Frame
-from pipeline.data.projection import project_points
-from pipeline.errors import DataError
 from pipeline.export.virconv import COLOUR_SCALE, MEASURED, VIRTUAL
+from pipeline.geometry.calibration import Calibration
+from pipeline.geometry.project import project_points
 
 SFD_ROW = 36
 # Mean colour difference in grey levels: 0 for points coloured from this image (float16 and a third: up to 1.5).

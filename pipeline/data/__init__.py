@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from pipeline.base.errors import UsageError
 from pipeline.data.dataset import Dataset
 from pipeline.data.folder import open_folder
 from pipeline.data.frame import Frame
@@ -13,7 +14,6 @@ from pipeline.data.kitti_object import open_kitti_object
 from pipeline.data.kitti_raw import open_kitti_raw
 from pipeline.data.nyuv2 import open_nyuv2
 from pipeline.data.vkitti2 import open_vkitti2
-from pipeline.errors import UsageError
 
 __all__ = ["READERS", "Dataset", "Frame", "open_dataset"]
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.errors import DataError
 from pipeline.data.images import read_bytes
 from pipeline.data.kitti_object import read_velodyne
-from pipeline.errors import DataError
 
 SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
 _PLY_TYPES = {

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+from pipeline.base.errors import DataError, UsageError
 from pipeline.data.frame import Frame
-from pipeline.errors import DataError, UsageError
 
 
 @dataclass(frozen=True, eq=False)

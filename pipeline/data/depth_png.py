@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.errors import DataError
 from pipeline.data.images import read_unchanged
-from pipeline.errors import DataError
 
 SCALE = 256.0
 MAX_DEPTH = 65535 / SCALE
@@ -64,6 +64,6 @@ def png_bytes(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
 
 def write_depth_png(path: str | Path, depth: NDArray[np.floating]) -> None:
     """Writes (H, W) metres as a 16-bit depth PNG; the file appears complete or not at all."""
-    from pipeline.runner.atomic import write_bytes
+    from pipeline.base.atomic import write_bytes
 
     write_bytes(Path(path), depth_png_bytes(depth))

@@ -15,14 +15,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pipeline.data.calibration import read_calibration
+from pipeline.base.errors import UsageError
 from pipeline.data.cloud_files import SUFFIXES, read_points
 from pipeline.data.dataset import Dataset
 from pipeline.data.depth_png import read_depth_png
 from pipeline.data.frame import Frame
 from pipeline.data.images import image_size, read_image
 from pipeline.data.kitti_object import read_instances, read_labels, read_semantics
-from pipeline.errors import UsageError
+from pipeline.geometry.calibration import read_calibration
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 

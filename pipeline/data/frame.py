@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from detection.kitti_format import KittiObject
 from detection.types import PointFrame
-from pipeline.data.calibration import Calibration
-from pipeline.errors import MissingPart
+from pipeline.base.errors import MissingPart
+from pipeline.geometry.calibration import Calibration
 
 PARTS = (
     "image",
@@ -102,7 +102,7 @@ class Frame:
         """(H, W) float32 metres, 0 = none: stored, or the z-buffered projection of `points`."""
         if "sparse_depth" in self.loaders:
             return np.asarray(self.loaders["sparse_depth"]())
-        from pipeline.data.projection import project_points
+        from pipeline.geometry.project import project_points
 
         return project_points(self.points, self.calibration, self.image_size)
 

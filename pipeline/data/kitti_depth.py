@@ -20,14 +20,14 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.data.calibration import Calibration
+from pipeline.base.errors import DataError, UsageError
 from pipeline.data.dataset import Dataset
 from pipeline.data.depth_png import read_depth_png
 from pipeline.data.frame import Frame
 from pipeline.data.images import image_size, read_bytes, read_image
 from pipeline.data.kitti_object import read_velodyne
 from pipeline.data.kitti_raw import DAY_LENGTH, raw_image_path, read_day_calibration
-from pipeline.errors import DataError, UsageError
+from pipeline.geometry.calibration import Calibration
 
 Loaders = dict[str, Callable[[], Any]]
 

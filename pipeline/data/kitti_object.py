@@ -17,14 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detection.kitti_format import KittiObject, format_line, parse_lines
-from pipeline.data.calibration import Calibration, format_calibration, read_calibration
+from pipeline.base.atomic import write_bytes, write_text
+from pipeline.base.errors import DataError, UsageError
+from pipeline.base.files import read_bytes, read_text
 from pipeline.data.dataset import Dataset
 from pipeline.data.depth_png import png_bytes, read_depth_png, write_depth_png
-from pipeline.data.files import read_bytes, read_text
 from pipeline.data.frame import Frame
 from pipeline.data.images import image_size, read_image, read_unchanged
-from pipeline.errors import DataError, UsageError
-from pipeline.runner.atomic import write_bytes, write_text
+from pipeline.geometry.calibration import Calibration, format_calibration, read_calibration
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 # Folders whose files make a frame: a frame that lacks one of them is reported when it is used, not left out silently.

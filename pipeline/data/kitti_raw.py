@@ -15,12 +15,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pipeline.data.calibration import Calibration, parse_raw_calibration
+from pipeline.base.errors import DataError, UsageError
 from pipeline.data.dataset import Dataset
 from pipeline.data.frame import Frame
 from pipeline.data.images import image_size, read_bytes, read_image
 from pipeline.data.kitti_object import read_velodyne
-from pipeline.errors import DataError, UsageError
+from pipeline.geometry.calibration import Calibration, parse_raw_calibration
 
 DAY_LENGTH = len("2011_09_26")
 IMAGE_SUFFIXES = (".png", ".jpg")

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.calibration import Calibration
+from pipeline.geometry.calibration import Calibration
 
 TOP_ELEVATION = np.deg2rad(2.0)
 ELEVATION_STEP_64 = np.deg2rad(0.4)

@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.calibration import Calibration
+from pipeline.base.errors import DataError, UsageError
 from pipeline.data.dataset import Dataset
 from pipeline.data.frame import Frame
 from pipeline.data.images import image_size, read_image, read_unchanged
 from pipeline.data.kitti_depth import camera_only
-from pipeline.errors import DataError, UsageError
+from pipeline.geometry.calibration import Calibration
 
 Loaders = dict[str, Callable[[], Any]]
 

@@ -22,15 +22,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detection.kitti_format import KittiObject
-from pipeline.data.calibration import Calibration
+from pipeline.base.errors import DataError, UsageError
 from pipeline.data.dataset import Dataset
 from pipeline.data.depth_png import read_depth_png
 from pipeline.data.frame import Frame
 from pipeline.data.images import check_complete, image_size, read_bytes, read_image, read_unchanged
 from pipeline.data.kitti_depth import camera_only
 from pipeline.data.lidar_like import depth_points, sample_like_lidar
-from pipeline.data.vkitti2_text import VkittiObject, objects_of_frame, read_camera_rows, read_colors
-from pipeline.errors import DataError, UsageError
+from pipeline.data.vkitti2_text import (
+    VkittiObject,
+    frame_numbers,
+    objects_of_frame,
+    part_folder,
+    read_camera_rows,
+    read_colors,
+    text_folder,
+)
+from pipeline.geometry.calibration import Calibration
 
 SCENES = ("Scene01", "Scene02", "Scene06", "Scene18", "Scene20")
 VARIATIONS = (
@@ -88,7 +96,7 @@ def open_vkitti2(root: str | Path) -> Dataset:
     for scene in SCENES:
         for variation in VARIATIONS:
             for camera in CAMERAS:
-                rgb = _part_folder(folder, "rgb", scene, variation) / "frames" / "rgb" / camera
+                rgb = part_folder(folder, "rgb", scene, variation) / "frames" / "rgb" / camera
                 names = sorted(path.stem.removeprefix("rgb_") for path in rgb.glob("rgb_*.jpg"))
                 ids.extend(f"{scene}/{variation}/{camera}/{name}" for name in names)
     if not ids:
@@ -118,32 +126,14 @@ def thesis_split(dataset: Dataset, name: str) -> Dataset:
     )
 
 
-def _part_folder(root: Path, part: str, scene: str, variation: str) -> Path:
-    """SceneXX/VARIATION of one archive ("rgb", "depth", "textgt", ...), in its own folder or in the common one."""
-    own = root / f"vkitti_2.0.3_{part}" / scene / variation
-    return own if own.is_dir() else root / scene / variation
-
-
 def frame_path(root: Path, frame_id: str, part: str, prefix: str, suffix: str) -> Path:
     """The file of one part of a frame; the folder's name is also accepted in lower case."""
     scene, variation, camera, number = frame_id.split("/")
-    frames = _part_folder(root, part, scene, variation) / "frames"
+    frames = part_folder(root, part, scene, variation) / "frames"
     folder = frames / part
     if not folder.is_dir() and (frames / part.lower()).is_dir():
         folder = frames / part.lower()
     return folder / camera / f"{prefix}_{number}{suffix}"
-
-
-def text_folder(root: Path, frame_id: str) -> Path:
-    """The folder with bbox.txt, pose.txt, ... of a frame's scene and variation."""
-    scene, variation, _, _ = frame_id.split("/")
-    return _part_folder(root, "textgt", scene, variation)
-
-
-def frame_numbers(frame_id: str) -> tuple[int, int]:
-    """(frame, camera) numbers of an id, as the text files give them."""
-    _, _, camera, number = frame_id.split("/")
-    return int(number), int(camera.removeprefix("Camera_"))
 
 
 def open_frame(root: Path, frame_id: str) -> Frame:

@@ -20,8 +20,8 @@ import numpy as np
 from detection.boxes import corners
 from detection.evaluation.difficulty import Vkitti2Difficulty, occlusion_from_fill
 from detection.types import Boxes3D
-from pipeline.data.vkitti2_text import VkittiObject, objects_of_folder, read_camera_rows
-from pipeline.errors import UsageError
+from pipeline.base.errors import UsageError
+from pipeline.data.vkitti2_text import VkittiObject, frame_numbers, objects_of_folder, read_camera_rows, text_folder
 
 RULES = ("fill", "hull", "literal")
 LEVELS = ("easy", "medium", "hard", "ignored")
@@ -118,8 +118,6 @@ def count_difficulties(
     root: Path, frame_ids: Iterable[str], rule: str, classes: Iterable[str] = ("Car",)
 ) -> dict[str, int]:
     """Objects per level over the frames of an open Virtual KITTI 2 data set, by one occlusion rule."""
-    from pipeline.data.vkitti2 import frame_numbers, text_folder
-
     counts = dict.fromkeys(LEVELS, 0)
     wanted = frozenset(classes)
     rules: dict[Path, Callable[[VkittiObject], float]] = {}

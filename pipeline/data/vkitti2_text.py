@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from pipeline.errors import DataError
+from pipeline.base.errors import DataError
 
 Key = tuple[int, int]
 
@@ -170,3 +170,21 @@ def read_colors(path: Path) -> dict[str, tuple[int, int, int]]:
         return {row[0]: (int(row[1]), int(row[2]), int(row[3])) for row in _rows(path, 4)}
     except ValueError as error:
         raise DataError(path, "Category r g b", str(error)) from None
+
+
+def part_folder(root: Path, part: str, scene: str, variation: str) -> Path:
+    """SceneXX/VARIATION of one archive ("rgb", "depth", "textgt", ...), in its own folder or in the common one."""
+    own = root / f"vkitti_2.0.3_{part}" / scene / variation
+    return own if own.is_dir() else root / scene / variation
+
+
+def text_folder(root: Path, frame_id: str) -> Path:
+    """The folder with bbox.txt, pose.txt, ... of a frame's scene and variation."""
+    scene, variation, _, _ = frame_id.split("/")
+    return part_folder(root, "textgt", scene, variation)
+
+
+def frame_numbers(frame_id: str) -> tuple[int, int]:
+    """(frame, camera) numbers of an id, as the text files give them."""
+    _, _, camera, number = frame_id.split("/")
+    return int(number), int(camera.removeprefix("Camera_"))

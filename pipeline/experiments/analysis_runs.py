@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import UsageError
+from pipeline.base.errors import UsageError
 from pipeline.experiments.runs import Context, Cost, Outcome
 from pipeline.experiments.tables import Recipe
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from pipeline.errors import UsageError
-from pipeline.experiments import chapter_2_3, chapter_4, chapter_5, chapter_5_exact, chapter_5_figures, embedded
+from pipeline.base.errors import UsageError
+from pipeline.base.settings import nearest_name
+from pipeline.experiments import bundled as embedded
+from pipeline.experiments import chapter_2_3, chapter_4, chapter_5, chapter_5_exact, chapter_5_figures
 from pipeline.experiments.tables import Table
-from pipeline.settings import nearest_name
 
 TABLES: tuple[Table, ...] = (
     *chapter_2_3.TABLES,

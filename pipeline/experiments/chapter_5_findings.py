@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipeline.experiments.findings import Finding
+from pipeline.experiments.finding import Finding
 
 FINDINGS: tuple[Finding, ...] = (
     Finding("Depth noise costs AP (5.8).", (("table", "5.8", ("blur costs", "misalignment costs")),)),

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.base.atomic import write_bytes, write_text
+from pipeline.base.errors import DataError, UsageError
+from pipeline.base.paths import RunFolder, safe_id
 from pipeline.data import Dataset, Frame
-from pipeline.errors import DataError, UsageError
 from pipeline.experiments.inputs import InputCloud, InputRecipe, lidar_points, make_input
-from pipeline.frame_files import FrameFiles
-from pipeline.paths import RunFolder, safe_id
-from pipeline.runner.atomic import write_bytes, write_text
+from pipeline.run_folder.frame_outputs import FrameFiles
 
 if TYPE_CHECKING:
     from completion.infer import Completer
@@ -69,7 +69,7 @@ class DepthCache:
         return files.read_completed()
 
     def _made(self, frame: Frame, depth: str, rows: int) -> CompletedDepth:
-        from pipeline.data.projection import project_points
+        from pipeline.geometry.project import project_points
 
         if depth == "semi_dense":
             from completion.types import CompletedDepth

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import UsageError
+from pipeline.base.errors import UsageError
+from pipeline.base.settings import nearest_name
 from pipeline.experiments.cloud_cache import CloudCache, DepthCache
 from pipeline.experiments.cloud_study import GAPS, LOWS, SigmaSweep
 from pipeline.experiments.detection_budget import DETECTION, DetectionBudget
@@ -23,7 +24,6 @@ from pipeline.experiments.runs import Context, Cost, Outcome
 from pipeline.experiments.tables import Recipe
 from pipeline.pointcloud.semantic_mask import object_score
 from pipeline.pointcloud.taxonomy import NOISE_BG, NOISE_FG, NOISE_INBET, UNKNOWN, Taxonomy, label_noise
-from pipeline.settings import nearest_name
 
 BUDGETS: Mapping[str, DetectionBudget] = DETECTION
 # Encoder levels of the thesis' backbone (Fig. 5.5).

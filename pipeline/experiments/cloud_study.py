@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from completion.types import CompletedDepth
-from pipeline.data.calibration import Calibration
-from pipeline.pointcloud.backproject import back_project
-from pipeline.pointcloud.clouds import DenseCloud
+from pipeline.geometry.back_project import back_project
+from pipeline.geometry.calibration import Calibration
+from pipeline.geometry.clouds import DenseCloud
 from pipeline.pointcloud.depth_source import read_completed
 from pipeline.pointcloud.grid_sampling import grid_sampling
 from pipeline.pointcloud.presets import AugmentSettings

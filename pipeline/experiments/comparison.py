@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.experiments import frames as stored
 from pipeline.experiments.chapter_2_3 import training
-from pipeline.experiments.completion_runs import default_read_out, load_weights, model_spec, test_frame
+from pipeline.experiments.completion_inputs import default_read_out, load_weights, model_spec, test_frame
 from pipeline.experiments.runs import Context, Outcome, do_run, plan_run
 from pipeline.experiments.tables import Recipe
 

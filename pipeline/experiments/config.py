@@ -9,9 +9,9 @@ from typing import Any
 
 import yaml
 
-from pipeline.errors import UsageError
+from pipeline.base.errors import UsageError
+from pipeline.base.settings import nearest_name
 from pipeline.experiments.runs import BUDGET_NAMES, KINDS
-from pipeline.settings import nearest_name
 
 
 @dataclass(frozen=True)

@@ -14,20 +14,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from detection.evaluation.bootstrap import Resampling
-from pipeline.errors import UsageError
+from pipeline.base.errors import UsageError
+from pipeline.base.paths import RunFolder
+from pipeline.base.settings import nearest_name, plain, with_changes
 from pipeline.experiments import detection_scores as scores
 from pipeline.experiments.cloud_cache import CloudCache, DepthCache, short_hash
-from pipeline.experiments.common_start import Mixture, start_inputs
+from pipeline.experiments.common_pretraining import Mixture, start_inputs
 from pipeline.experiments.detection_budget import DEFAULT_DETECTOR, DETECTION, DetectionBudget, DetectorChoice
 from pipeline.experiments.example import write_example
 from pipeline.experiments.inputs import InputRecipe
 from pipeline.experiments.runs import Context, Cost, Outcome
 from pipeline.experiments.tables import Recipe
 from pipeline.experiments.worlds import World, open_world, world_identity
-from pipeline.frame_files import FrameFiles
-from pipeline.paths import RunFolder
 from pipeline.pointcloud.taxonomy import LABELS
-from pipeline.settings import nearest_name, plain, with_changes
+from pipeline.run_folder.frame_outputs import FrameFiles
 
 if TYPE_CHECKING:
     from detection.kitti_format import KittiObject

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from detection.boxes import corners
 from detection.kitti_format import KittiObject, boxes_of
-from pipeline.errors import DataError
-from pipeline.runner.atomic import write_bytes
+from pipeline.base.atomic import write_bytes
+from pipeline.base.errors import DataError
 
 if TYPE_CHECKING:
     from pipeline.data import Frame

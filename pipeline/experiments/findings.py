@@ -10,28 +10,17 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.base.atomic import write_text
 from pipeline.experiments.catalogue import find
+from pipeline.experiments.finding import Finding
 from pipeline.experiments.intervals import FAILS, HOLDS, UNKNOWN, Verdict
 from pipeline.experiments.plan import Order, gather, make_plan
-from pipeline.runner.atomic import write_text
 
 BEGIN, END = "<!-- findings: begin -->", "<!-- findings: end -->"
 DETECTION_MARKS = ("<!-- detection findings: begin -->", "<!-- detection findings: end -->")
 CONFIRMED, NOT_CONFIRMED, NOT_DECIDABLE = "confirmed", "not confirmed", "not decidable"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A claim in one sentence, and the orderings that test it: (kind, number, beginnings of the claims' texts).
-
-    A number may end in "@16": the table at so many LiDAR rows.
-    """
-
-    claim: str
-    tests: tuple[tuple[str, str, tuple[str, ...]], ...]
 
 
 FINDINGS: tuple[Finding, ...] = (

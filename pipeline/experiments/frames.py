@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import UsageError
+from pipeline.base.atomic import write_bytes
+from pipeline.base.errors import UsageError
 from pipeline.experiments.budgets import CompletionBudget
-from pipeline.runner.atomic import write_bytes
 from pipeline.runner.keys import code_version
 
 if TYPE_CHECKING:
@@ -200,8 +200,8 @@ def _synthetic(budget: CompletionBudget) -> Iterator[Maker]:
 
 def simulate(budget: CompletionBudget, index: int) -> StoredFrame:
     """Street `index` of the synthetic world with clean depth."""
-    from pipeline.data.projection import project_points
-    from pipeline.simulation.lidar_rows import split_rings
+    from pipeline.geometry.project import project_points
+    from pipeline.geometry.rings import split_rings
 
     street = Street(budget, index)
     view = street.views(0)[0]
@@ -291,8 +291,8 @@ def _read(dataset: Dataset, budget: CompletionBudget) -> Iterator[Maker]:
 
 def read_frame(dataset: Dataset, frame_id: str) -> StoredFrame:
     """A frame of the user's data set; fewer rows only where it has points."""
-    from pipeline.data.projection import project_points
-    from pipeline.simulation.lidar_rows import split_rings
+    from pipeline.geometry.project import project_points
+    from pipeline.geometry.rings import split_rings
 
     frame = dataset[frame_id]
     if not frame.has("target_depth"):

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.errors import UsageError
+from pipeline.base.seeds import derive_seed
+from pipeline.base.settings import nearest_name, plain, with_changes
 from pipeline.data import Frame
-from pipeline.errors import UsageError
-from pipeline.pointcloud.lidar_pixels import lidar_pixels, value_at
+from pipeline.geometry.in_view import lidar_pixels, value_at
 from pipeline.pointcloud.presets import PRESETS, AugmentSettings
 from pipeline.pointcloud.semantic_mask import object_score
 from pipeline.pointcloud.taxonomy import CLEAN, Taxonomy, label_noise
-from pipeline.runner.seeds import derive_seed
-from pipeline.settings import nearest_name, plain, with_changes
 from pipeline.simulation.noise import NoiseSettings, add_noise
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ def _has_rings(frame: Frame) -> bool:
 
 def lidar_points(frame: Frame, rows: int) -> NDArray[np.float32]:
     """(N, 4) raw returns of every (64 / rows)-th ring. UsageError where the points are in no scan order."""
-    from pipeline.simulation.lidar_rows import subsample_rows
+    from pipeline.geometry.rings import subsample_rows
     from pipeline.stages import lidar_of
 
     points = lidar_of(frame)

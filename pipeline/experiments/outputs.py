@@ -7,11 +7,11 @@ import io
 import math
 from pathlib import Path
 
+from pipeline.base.atomic import write_text
 from pipeline.experiments.intervals import Estimate, estimate
 from pipeline.experiments.plan import Order, TableResult
 from pipeline.experiments.runs import available
 from pipeline.experiments.tables import Column, Row
-from pipeline.runner.atomic import write_text
 
 WARNING = (
     "Ours are small networks, trained briefly on other data: the absolute values cannot be compared with the thesis', "

@@ -13,11 +13,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from pipeline.errors import UsageError
+from pipeline.base.atomic import remove_leftovers, write_text
+from pipeline.base.errors import UsageError
+from pipeline.base.settings import nearest_name, plain, with_changes
+from pipeline.base.versions import made_with
 from pipeline.experiments.tables import Recipe
-from pipeline.runner.atomic import remove_leftovers, write_text
-from pipeline.settings import nearest_name, plain, with_changes
-from pipeline.versions import made_with
 
 BUDGET_NAMES = ("smoke", "small", "paper")
 
@@ -27,8 +27,8 @@ KINDS: dict[str, str] = {
     "analysis": "pipeline.experiments.analysis_runs",
     "detection": "pipeline.experiments.detection_runs",
     "cloud": "pipeline.experiments.cloud_runs",
-    "completer": "pipeline.experiments.embedded_runs",
-    "selection": "pipeline.experiments.embedded_runs",
+    "completer": "pipeline.experiments.bundled_runs",
+    "selection": "pipeline.experiments.bundled_runs",
 }
 
 

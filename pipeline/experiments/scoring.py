@@ -42,7 +42,7 @@ def frame_scores(depth: Depth, target: Depth) -> dict[str, float]:
 
 def read_outs(completer: NetworkCompleter, spec: ModelSpec, frame: DepthFrame) -> dict[str, Depth]:
     """Depth by read-out name; the first is the network's default."""
-    from completion.readout import READ_OUTS_OF
+    from completion.decoding import READ_OUTS_OF
     from completion.twin_surface import fuse
 
     completed = completer.complete(frame.sparse, frame.image)

@@ -10,13 +10,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.errors import UsageError
+from pipeline.base.seeds import derive_seed
 from pipeline.data import Frame
-from pipeline.data.projection import project_points
-from pipeline.errors import UsageError
-from pipeline.pointcloud.backproject import back_project
+from pipeline.geometry.back_project import back_project
+from pipeline.geometry.project import project_points
 from pipeline.pointcloud.range_image import RangeGrid, range_sample
 from pipeline.pointcloud.semantic_mask import OBJECTS, object_score
-from pipeline.runner.seeds import derive_seed
 from pipeline.simulation.rig import BASELINE
 from pipeline.simulation.semi_dense import HALF_WINDOW, PoseNoise, accumulate, consistent
 

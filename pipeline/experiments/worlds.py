@@ -11,9 +11,9 @@ import numpy as np
 
 from detection.evaluation.difficulty import DifficultyRule, KittiDifficulty, Vkitti2Difficulty
 from detection.evaluation.objects import Array, Mask
+from pipeline.base.atomic import write_text
+from pipeline.base.errors import UsageError
 from pipeline.data import Dataset, open_dataset
-from pipeline.errors import UsageError
-from pipeline.runner.atomic import write_text
 from pipeline.runner.keys import code_version
 
 # One seed of the synthetic world for training frames, another for test frames.
@@ -118,8 +118,8 @@ def synthetic_frames(
     folder = root / f"frames-{seed}-{shape}-{code_version('pipeline/simulation')[:8]}"
     missing = [index for index in range(frames) if not (folder / "written" / f"{index:06d}").is_file()]
     if missing:
-        from pipeline.data.writers import write_job
         from pipeline.simulation.synth import SynthSettings
+        from pipeline.simulation.writers import write_job
 
         settings = SynthSettings(frames=frames, seed=seed, size=size)
         say(f"writing {len(missing)} synthetic frames (seed {seed}) to {folder}")

@@ -9,16 +9,16 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+from pipeline.base.atomic import write_text
+from pipeline.base.errors import DataError, UsageError
+from pipeline.base.paths import RunFolder
 from pipeline.data.dataset import Dataset
 from pipeline.data.frame import Frame
-from pipeline.errors import DataError, UsageError
+from pipeline.export.disk_buffer import Spool
 from pipeline.export.formats import FORMATS
 from pipeline.export.record import VIRTUAL, Options, Record
 from pipeline.export.source import ExportFrame, consumer_names, read_splits
-from pipeline.export.spool import Spool
 from pipeline.export.workers import map_ordered
-from pipeline.paths import RunFolder
-from pipeline.runner.atomic import write_text
 
 
 @dataclass

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline.export import clouds, kitti_tree, mmdet3d, openpcdet, parquet, sfd, virconv
+from pipeline.export.disk_buffer import Spool
 from pipeline.export.record import Options, Record
 from pipeline.export.source import ExportFrame
-from pipeline.export.spool import Spool
 
 WriteFrame = Callable[[ExportFrame, Path, Options], Record]
 Finish = Callable[[Path, Mapping[str, Spool], list[str], Mapping[str, frozenset[str]]], list[Path]]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from detection.boxes import to_lidar
 from detection.types import Boxes3D
-from pipeline.data.calibration import Calibration
+from pipeline.geometry.calibration import Calibration
 
 Array = NDArray[np.float64]
 

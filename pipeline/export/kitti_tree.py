@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from detection.kitti_format import KittiObject
+from pipeline.base.atomic import write_bytes
 from pipeline.data.depth_png import png_bytes
 from pipeline.data.kitti_object import write_calibration, write_objects, write_velodyne
 from pipeline.export.record import Options, Record
 from pipeline.export.source import ExportFrame
-from pipeline.runner.atomic import write_bytes
 
 
 def write_kitti_frame(item: ExportFrame, folder: Path, options: Options) -> int:

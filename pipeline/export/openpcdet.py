@@ -18,14 +18,14 @@ import numpy as np
 
 from detection.boxes import wrap_angle
 from detection.kitti_format import KittiObject, boxes_of
+from pipeline.base.atomic import write_bytes, write_text
 from pipeline.data.kitti_object import write_velodyne
+from pipeline.export.disk_buffer import Spool, write_streamed
 from pipeline.export.geometry import boxes_in_lidar, in_image, points_in_box
 from pipeline.export.kitti_tree import care_first, square, write_kitti_frame
 from pipeline.export.pickles import item_opcodes, write_dict_of_lists, write_list
 from pipeline.export.record import Options, Record
 from pipeline.export.source import ExportFrame
-from pipeline.export.spool import Spool, write_streamed
-from pipeline.runner.atomic import write_bytes, write_text
 
 INFOS, DATABASE = "infos", "database/"
 

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import BinaryIO
 
-from pipeline.errors import UsageError
+from pipeline.base.errors import UsageError
+from pipeline.export.disk_buffer import Spool, write_streamed
 from pipeline.export.record import Options, Record
 from pipeline.export.source import ExportFrame
-from pipeline.export.spool import Spool, write_streamed
 
 ROWS = "rows"
 NUMBERS = ("score", "x", "y", "z", "h", "w", "l", "ry", "alpha", "x1", "y1", "x2", "y2")

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from completion.types import CompletedDepth
 from detection.kitti_format import KittiObject
+from pipeline.base.errors import DataError, MissingPart
+from pipeline.base.paths import RunFolder
 from pipeline.data.cloud_files import Cloud
 from pipeline.data.frame import Frame
 from pipeline.data.kitti_object import read_labels
-from pipeline.errors import DataError, MissingPart
-from pipeline.frame_files import FrameFiles, read_npz, read_run_file
-from pipeline.paths import RunFolder
+from pipeline.run_folder.frame_outputs import FrameFiles, read_npz, read_run_file
 
 BASE_COLUMNS = ("x", "y", "z", "intensity", "source")
 RAW_COLUMNS = BASE_COLUMNS[:4]

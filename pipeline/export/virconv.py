@@ -17,12 +17,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.atomic import write_bytes
 from pipeline.data.lidar_like import pixels_to_velo
 from pipeline.export.geometry import depth_pixels, in_image
 from pipeline.export.kitti_tree import write_kitti_frame
 from pipeline.export.record import Options, Record
 from pipeline.export.source import ExportFrame
-from pipeline.runner.atomic import write_bytes
 
 WINDOW = (352, 1216)
 CELL = 0.002

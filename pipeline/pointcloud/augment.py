@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from completion.types import CompletedDepth
-from pipeline.data.calibration import Calibration
-from pipeline.errors import UsageError
-from pipeline.pointcloud.backproject import back_project
-from pipeline.pointcloud.clouds import DenseCloud
+from pipeline.base.errors import UsageError
+from pipeline.geometry.back_project import back_project
+from pipeline.geometry.calibration import Calibration
+from pipeline.geometry.clouds import DenseCloud
+from pipeline.geometry.in_view import lidar_pixels, value_at
 from pipeline.pointcloud.columns import completed_columns, measured_columns
 from pipeline.pointcloud.depth_sampling import back_project_and_sample
 from pipeline.pointcloud.grid_sampling import grid_sampling
-from pipeline.pointcloud.lidar_pixels import lidar_pixels, value_at
 from pipeline.pointcloud.presets import PRESETS, AugmentSettings, preset
 from pipeline.pointcloud.radius_gather import radius_gather
 from pipeline.pointcloud.range_image import range_sample

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from completion.types import CompletedDepth
-from pipeline.pointcloud.clouds import DenseCloud
-from pipeline.pointcloud.lidar_pixels import value_at
+from pipeline.geometry.clouds import DenseCloud
+from pipeline.geometry.in_view import value_at
 
 
 def expected_error(completed: CompletedDepth) -> NDArray[np.float32]:

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.calibration import Calibration
-from pipeline.pointcloud.backproject import PixelRays, usable_pixels
+from pipeline.geometry.back_project import PixelRays, usable_pixels
+from pipeline.geometry.calibration import Calibration
+from pipeline.geometry.clouds import DenseCloud
 from pipeline.pointcloud.cells import CellBuilder
-from pipeline.pointcloud.clouds import DenseCloud
 from pipeline.pointcloud.grid_sampling import GridSampling, add_block, first_of_cells, nearest_in_block, settle
 
 # A block of this many pixels (three coordinates, 290 kB) stays in the second-level cache between its uses.

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from completion.types import CompletedDepth
+from pipeline.base.errors import DataError
 from pipeline.data.depth_png import read_depth_png
-from pipeline.errors import DataError
 from pipeline.pointcloud.pseudo_sigma import pseudo_sigma
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pipeline.geometry.clouds import DenseCloud
 from pipeline.pointcloud.cells import Cells, occupied_cells
-from pipeline.pointcloud.clouds import DenseCloud
 
 Representative = Literal["nearest", "first", "centroid"]
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from detection.boxes import corners
 from detection.evaluation.explain import Explanation
 from detection.kitti_format import KittiObject, boxes_of
-from pipeline.data.calibration import Calibration
-from pipeline.report.judged import is_wrong, verdict_text
+from pipeline.geometry.calibration import Calibration
+from pipeline.report.matches import is_wrong, verdict_text
 from pipeline.report.pictures import BirdsEye
 
 # Pairs of corners (order of detection.boxes.corners: bottom face, then top face) that make the twelve edges.

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.errors import DataError
 from pipeline.data import Frame
-from pipeline.errors import DataError
-from pipeline.frame_files import FrameFiles
-from pipeline.pointcloud.lidar_pixels import lidar_pixels
+from pipeline.geometry.in_view import lidar_pixels
 from pipeline.report import pictures
+from pipeline.run_folder.frame_outputs import FrameFiles
 
 # All frames of a page share this many points, so that 20 frames stay under 15 MB; one frame takes no more than MOST.
 POINTS_OF_A_PAGE, MOST_POINTS = 300_000, 24_000

@@ -18,14 +18,14 @@ from detection.evaluation.curves import Curve
 from detection.evaluation.difficulty import LEVELS
 from detection.evaluation.protocol import Target
 from detection.kitti_format import KittiObject
-from pipeline.config import Config
+from pipeline.base.atomic import write_bytes
+from pipeline.base.errors import DataError
+from pipeline.base.paths import RunFolder
 from pipeline.data import Dataset, Frame
-from pipeline.errors import DataError
-from pipeline.frame_files import FrameFiles
-from pipeline.paths import RunFolder
 from pipeline.report import panels
-from pipeline.report.judged import Judged, strictest
-from pipeline.runner.atomic import write_bytes
+from pipeline.report.matches import Judged, strictest
+from pipeline.run_folder.config import Config
+from pipeline.run_folder.frame_outputs import FrameFiles
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -171,7 +171,7 @@ def completion(material: Material) -> Figure:
 
 def sigma_filter(material: Material) -> Figure:
     """As Fig. 5.6: the pixels in the plane of sigma and depth difference, and the cloud before and after the filter."""
-    from pipeline.pointcloud.backproject import back_project
+    from pipeline.geometry.back_project import back_project
     from pipeline.pointcloud.sigma_filter import SigmaBand
     from pipeline.pointcloud.sigma_filter import sigma_filter as keep_of
 

@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config import Config
+from pipeline.base.atomic import write_text
+from pipeline.base.errors import UsageError
+from pipeline.base.paths import RunFolder
+from pipeline.base.versions import made_with
 from pipeline.data import Dataset
-from pipeline.errors import UsageError
-from pipeline.frame_files import FrameFiles
-from pipeline.paths import RunFolder
 from pipeline.report import pictures
 from pipeline.report.cloud import palettes, point_budget
 from pipeline.report.hover import hover_step
-from pipeline.report.judged import (
+from pipeline.report.matches import (
     CurvePanel,
     Judged,
     Mistake,
@@ -29,11 +29,11 @@ from pipeline.report.judged import (
     judge,
     mistakes,
 )
-from pipeline.report.tables import DEPTH_NAMES, ap_header, ap_rows, depth_rows
 from pipeline.report.views import Display, FrameView, MistakeView, frame_view, mistake_view
-from pipeline.runner.atomic import write_text
-from pipeline.versions import made_with
-from pipeline.weights import detection_weights, detector_name
+from pipeline.run_folder.config import Config
+from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.run_folder.weights import detection_weights, detector_name
+from pipeline.scoring.tables import DEPTH_NAMES, ap_header, ap_rows, depth_rows
 
 FOLDER = Path(__file__).resolve().parent
 # The worst mistakes listed at the top, and the share of the shown frames that is chosen for them.
@@ -98,9 +98,9 @@ def write_beside(
         return write_figures(config, run, dataset, frames, judged, least)
     if kind == "html":
         return []
-    from pipeline.viewers.mcap_file import write_mcap
-    from pipeline.viewers.rerun_file import write_rrd
-    from pipeline.viewers.scene import scenes
+    from pipeline.report.recordings.mcap_file import write_mcap
+    from pipeline.report.recordings.rerun_file import write_rrd
+    from pipeline.report.recordings.scene import scenes
 
     write = write_rrd if kind == "rrd" else write_mcap
     path = run.report.parent / f"{run.root.name}.{kind}"

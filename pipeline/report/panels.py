@@ -245,7 +245,7 @@ def _noise_from_above(
     axis: Axes, frame: Frame, completed: CompletedDepth, labels: Any, part: Any, found: Sequence[KittiObject]
 ) -> None:
     """Points of a piece of the image from above in the colours of their kinds, boxes over them."""
-    from pipeline.pointcloud.backproject import back_project
+    from pipeline.geometry.back_project import back_project
     from pipeline.pointcloud.taxonomy import CLEAN, COLOURS
 
     crop, kind = part

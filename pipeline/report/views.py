@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.errors import DataError
+from pipeline.base.paths import RunFolder
 from pipeline.data import Frame
-from pipeline.errors import DataError
-from pipeline.frame_files import FrameFiles
-from pipeline.paths import RunFolder
 from pipeline.report import pictures
 from pipeline.report.boxes import DrawnBox, drawn_boxes
 from pipeline.report.cloud import cloud_of_frame, still_picture
 from pipeline.report.hover import HoverGrid, hover_grid
-from pipeline.report.judged import Judged, Mistake, counts_of
+from pipeline.report.matches import Judged, Mistake, counts_of
+from pipeline.run_folder.frame_outputs import FrameFiles
 
 PHOTO_WIDTH, MAP_WIDTH = 1242, 620
 THUMB_WIDTH, THUMB_HEIGHT = 240, 140

@@ -8,16 +8,16 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
-from pipeline.config import Config
+from pipeline.base.errors import DataError, UsageError
+from pipeline.base.paths import RunFolder
+from pipeline.base.progress import Counter, progress
 from pipeline.data import Dataset
-from pipeline.errors import DataError, UsageError
-from pipeline.paths import RunFolder
+from pipeline.run_folder.config import Config
 from pipeline.runner.budget import DiskBudget
 from pipeline.runner.jobs import Outcome, Task
 from pipeline.runner.keys import stage_key, task_key
 from pipeline.runner.ledger import Ledger, Row
 from pipeline.runner.processes import LocalEngine, WorkerFactory, available_cores
-from pipeline.runner.progress import Counter, progress
 from pipeline.runner.signals import StopRequest
 from pipeline.runner.worker import FrameWorker
 from pipeline.stages import FRAME_STAGES, open_frames

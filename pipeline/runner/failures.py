@@ -6,8 +6,8 @@ import json
 import shlex
 from collections.abc import Sequence
 
-from pipeline.paths import RunFolder
-from pipeline.runner.atomic import write_text
+from pipeline.base.atomic import write_text
+from pipeline.base.paths import RunFolder
 from pipeline.runner.jobs import Failure
 from pipeline.runner.ledger import all_failures
 

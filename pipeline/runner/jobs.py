@@ -7,8 +7,8 @@ import traceback
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from pipeline.errors import DataError, UsageError
-from pipeline.frame_files import Written
+from pipeline.base.errors import DataError, UsageError
+from pipeline.run_folder.frame_outputs import Written
 
 # Errors after which going on with the next frame would only repeat them.
 _FATAL_ERRNO = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the disk quota is used up", errno.EROFS: "read-only"}

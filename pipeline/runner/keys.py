@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.base.errors import DataError
 from pipeline.data.frame import Frame
-from pipeline.errors import DataError
-from pipeline.frame_files import content_hash
+from pipeline.run_folder.frame_outputs import content_hash
 
 PACKAGES = Path(__file__).resolve().parent.parent.parent
 

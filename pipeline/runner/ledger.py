@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
-from pipeline.errors import UsageError
-from pipeline.frame_files import Written, file_content_hash
+from pipeline.base.errors import UsageError
+from pipeline.run_folder.frame_outputs import Written, file_content_hash
 from pipeline.runner.jobs import Failure, Outcome
 
 _SCHEMA = """

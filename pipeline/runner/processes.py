@@ -18,7 +18,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Protocol
 
-from pipeline.errors import UsageError
+from pipeline.base.errors import UsageError
 from pipeline.runner.jobs import Outcome, Task, crashed
 
 # One in hand and one to go on with.

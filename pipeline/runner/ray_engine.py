@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from itertools import chain, repeat
 from typing import Any
 
-from pipeline.errors import UsageError
+from pipeline.base.errors import UsageError
 from pipeline.runner.jobs import Outcome, Task, crashed
 from pipeline.runner.processes import TASKS_PER_WORKER, Worker, WorkerFactory, use_one_thread
 

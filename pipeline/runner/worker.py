@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from pipeline.config import Config
+from pipeline.base.errors import DataError, UsageError
+from pipeline.base.files import check_inside
+from pipeline.base.paths import RunFolder
 from pipeline.data import Frame
-from pipeline.data.files import check_inside
-from pipeline.errors import DataError, UsageError
-from pipeline.frame_files import FrameFiles
-from pipeline.paths import RunFolder
+from pipeline.run_folder.config import Config
+from pipeline.run_folder.frame_outputs import FrameFiles
 from pipeline.runner.jobs import Outcome, Task, outcome_of_error
 from pipeline.stages import FRAME_STAGES, FrameFunction, data_root, open_frames
 

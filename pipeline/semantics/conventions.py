@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.errors import DataError
 from pipeline.data.vkitti2 import colors_to_train_ids
-from pipeline.errors import DataError
 
 NONE = 255
 CLASSES = (

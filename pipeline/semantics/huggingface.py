@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import DataError, UsageError
+from pipeline.base.errors import DataError, UsageError
 from pipeline.semantics.conventions import CLASSES, NONE
 
 

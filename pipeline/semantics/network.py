@@ -18,8 +18,8 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from pipeline.errors import DataError
-from pipeline.runner.atomic import write_bytes
+from pipeline.base.atomic import write_bytes
+from pipeline.base.errors import DataError
 from pipeline.semantics.conventions import CLASSES
 
 WEIGHTS = Path(__file__).parent / "weights"

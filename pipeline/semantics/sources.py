@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detection.kitti_format import KittiObject
+from pipeline.base.errors import DataError, UsageError
 from pipeline.data.frame import Frame
 from pipeline.data.images import read_unchanged
-from pipeline.errors import DataError, UsageError
 from pipeline.semantics.conventions import NONE, to_train_ids
 
 if TYPE_CHECKING:

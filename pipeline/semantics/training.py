@@ -19,7 +19,7 @@ from torch import Tensor
 from completion.resume import load_state, save_state
 from completion.samples import Augmentation, disturb_image
 from completion.train import TrainProgress
-from pipeline.runner.atomic import write_text
+from pipeline.base.atomic import write_text
 from pipeline.semantics.conventions import CLASSES, NONE
 from pipeline.semantics.network import LabelledImage, StreetSegmenter, image_tensor, save_segmenter
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.calibration import Calibration
+from pipeline.geometry.calibration import Calibration
 
 BASELINE = 0.532725
 LIDAR_HEIGHT = 1.73

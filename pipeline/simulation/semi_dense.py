@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.calibration import Calibration
-from pipeline.data.projection import project_points
+from pipeline.geometry.calibration import Calibration
+from pipeline.geometry.project import project_points
 from pipeline.simulation.rig import BASELINE
 
 HALF_WINDOW = 5

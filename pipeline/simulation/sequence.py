@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from pipeline.data.calibration import Calibration
+from pipeline.geometry.calibration import Calibration
 from pipeline.simulation.rig import draw_rig
 from pipeline.simulation.scenes.layouts import draw_scene
 from pipeline.simulation.scenes.scene import Scene

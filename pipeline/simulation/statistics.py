@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detection.kitti_format import KittiObject, boxes_of
-from pipeline.data.calibration import Calibration
-from pipeline.data.projection import project_points
-from pipeline.simulation.lidar_rows import split_rings
+from pipeline.geometry.calibration import Calibration
+from pipeline.geometry.project import project_points
+from pipeline.geometry.rings import split_rings
 
 DEPTH_EDGES = np.array([0, 5, 10, 15, 20, 30, 40, 60, 80.0])
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from detection.kitti_format import KittiObject
-from pipeline.data.calibration import Calibration
+from pipeline.geometry.calibration import Calibration
 from pipeline.simulation.labels import ObjectTruth, kitti_labels, measure
 from pipeline.simulation.lidar import scan, sensor
 from pipeline.simulation.render import View, render
@@ -135,53 +132,3 @@ def observe(
         T_world_cam=T_world_cam,
         street=scene.layout,
     )
-
-
-Progress = Callable[[int, int], None]
-
-
-def write_dataset(root: Path, settings: SynthSettings, workers: int = 1, progress: Progress | None = None) -> Path:
-    """Writes settings.frames frames below `root` in the layout asked for and returns `root`.
-
-    workers   processes; 1 works in this one. The files do not depend on it, and a worker holds one frame at a time.
-    progress  called with (frames done, frames in all) after each frame
-    """
-    from pipeline.data.writers import finish, plan
-
-    root = Path(root)
-    jobs = plan(settings)
-    for done, _ in enumerate(_completed(root, settings, jobs, workers), start=1):
-        if progress is not None:
-            progress(done, len(jobs))
-    finish(root, settings)
-    return root
-
-
-def _completed(root: Path, settings: SynthSettings, jobs: list[int], workers: int) -> Iterator[int]:
-    """Runs the jobs and yields each as it is finished."""
-    if workers <= 1:
-        for job in jobs:
-            yield _run(root, settings, job)
-        return
-    from concurrent.futures import ProcessPoolExecutor, as_completed
-    from multiprocessing import get_context
-
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_one_thread) as pool:
-        for future in as_completed([pool.submit(_run, root, settings, job) for job in jobs]):
-            yield future.result()
-
-
-def _one_thread() -> None:
-    """Keeps a worker to one thread: the processes share the cores."""
-    os.environ["OMP_NUM_THREADS"] = "1"
-    import cv2
-
-    cv2.setNumThreads(1)
-
-
-def _run(root: Path, settings: SynthSettings, job: int) -> int:
-    """One job of one worker: simulate and write."""
-    from pipeline.data.writers import write_job
-
-    write_job(root, settings, job)
-    return job

@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import UsageError
-from pipeline.runner.atomic import write_text
+from pipeline.base.atomic import write_text
+from pipeline.base.errors import UsageError
 
 COLUMNS = ("mae", "rmse", "tmae", "trmse", "mixed", "mixed_all", "edge_tmae", "missing", "seconds")
 
@@ -86,7 +86,7 @@ def _completers(chosen: str | None) -> list[str]:
     """The methods asked for. Raises ValueError for weights that do not exist."""
     from completion.checkpoints import find_weights
     from pipeline.benchmark.suite import WITHOUT_WEIGHTS
-    from pipeline.weights import embedded_names
+    from pipeline.run_folder.weights import embedded_names
 
     if chosen is None:
         return [*WITHOUT_WEIGHTS, *embedded_names("completion")]
@@ -101,7 +101,7 @@ def _detection_rows(chosen: str | None, threshold: float | None) -> list[Any]:
     """Every detector on the clouds it was trained for, at 64 and at 16 rows."""
     from detection.checkpoints import find_weights, read_card
     from pipeline.benchmark.suite import DetectionRow
-    from pipeline.weights import embedded_names
+    from pipeline.run_folder.weights import embedded_names
 
     names = embedded_names("detection") if chosen is None else [name for name in chosen.split(",") if name]
     rows = []

@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from pipeline.errors import UsageError
+from pipeline.base.errors import UsageError
 
 EXAMPLES = """\
 examples:
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _show(target: str | None, record: dict[str, object], lines: list[str]) -> None:
     """The report as text, as JSON on the screen, or as text with JSON in a file."""
-    from pipeline.runner.atomic import write_text
+    from pipeline.base.atomic import write_text
 
     text = json.dumps(record, indent=1)
     if target == "-":

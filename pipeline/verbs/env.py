@@ -11,9 +11,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from pipeline.base.versions import made_with
+from pipeline.run_folder.weights import embedded_names
 from pipeline.runner.processes import available_cores
-from pipeline.versions import made_with
-from pipeline.weights import embedded_names
 
 # extra of this package -> modules it brings (pyproject.toml)
 EXTRAS: dict[str, tuple[str, ...]] = {

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from detection.kitti_format import KittiObject
-from pipeline.errors import DataError, UsageError
+from pipeline.base.errors import DataError, UsageError
 
 EXAMPLES = """\
 examples:
@@ -92,9 +92,9 @@ def import_results(path: Path, out: Path) -> int:
     The pickle is read by an unpickler that knows containers and arrays only. Frames without objects give empty files.
     Raises DataError when an entry lacks a field.
     """
+    from pipeline.base.paths import safe_id
     from pipeline.check.safe_pickle import load_infos
     from pipeline.data.kitti_object import write_objects
-    from pipeline.paths import safe_id
 
     frames = load_infos(path)
     if not isinstance(frames, list):

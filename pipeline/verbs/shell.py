@@ -32,16 +32,16 @@ def script(shell: str) -> str:
 
 def stages() -> list[str]:
     """Everything that --stage takes."""
-    from pipeline.cli import STAGE_HELP
     from pipeline.verbs import available_verbs
+    from pipeline.verbs.parsers import STAGE_HELP
 
     return list(dict.fromkeys((*STAGE_HELP, *available_verbs())))
 
 
 def words_of_stages() -> dict[str, list[str]]:
     """stage -> its options; "*", last, stands for a stage without options of its own."""
-    from pipeline.cli import main_parser, verb_parser
     from pipeline.verbs import available_verbs
+    from pipeline.verbs.parsers import main_parser, verb_parser
 
     verbs = available_verbs()
     own = {verb: _options(verb_parser(verb, about)) for verb, about in verbs.items()}

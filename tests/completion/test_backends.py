@@ -11,9 +11,9 @@ import torch
 
 from completion import backends
 from completion.checkpoints import Card, save_checkpoint
+from completion.decoding import default_read_out
 from completion.infer import NetworkCompleter, load_completer
 from completion.models import build_model, default_spec
-from completion.readout import default_read_out
 from tests.completion.scenes import street
 
 SMALL = {"selection": {"width": 8}, "twise": {"channels": 8}, "msg_chn": {"channels": 4}}

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from completion.checkpoints import Card, CheckpointError, save_checkpoint
+from completion.decoding import read_output
 from completion.infer import NetworkCompleter, load_completer
 from completion.models import build_model, default_spec
 from completion.models.classical import ClassicalCompleter, linear_inverse_depth, morphological, nearest_depth
-from completion.readout import read_output
 from completion.twin_surface import READ_OUTS, fuse
 from tests.completion.scenes import street
 

@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from completion.decoding import MIXTURE_READ_OUTS, read_output
 from completion.losses import ale, rale
 from completion.mixture import expected_depth, negative_log_likelihood, quantiles, twin_surfaces
 from completion.models import default_spec
-from completion.readout import MIXTURE_READ_OUTS, read_output
 
 
 def mixture(weights: list[float], depths: list[float], raw_scale: float = 4.0) -> Tensor:

@@ -14,7 +14,7 @@ from completion.models import build_model, default_spec
 from completion.models.ring_coefficients import RingCoefficients, ring_coefficients
 from completion.models.rings import Rings, find_rings
 from completion.models.selection import Selection
-from completion.objectives import Objective, training_loss
+from completion.training_loss import Objective, training_loss
 from tests.completion.scenes import street
 from tests.completion.test_selection import tensors
 

@@ -10,13 +10,13 @@ import torch
 from torch.nn import functional as F
 
 from completion.checkpoints import Card, load_checkpoint, save_checkpoint
+from completion.cpu.selection import complete_mixture
+from completion.decoding import MIXTURE_READ_OUTS, read_output
 from completion.inputs import scale_rgb
 from completion.mixture import negative_log_likelihood, twin_surfaces
 from completion.models import build_model, default_spec
 from completion.models.rings import find_rings
 from completion.models.selection import CANDIDATES, CHANNELS, Selection, candidate_depths
-from completion.models.selection_cpu import complete_mixture
-from completion.readout import MIXTURE_READ_OUTS, read_output
 from completion.types import DepthFrame
 from tests.completion.scenes import street
 

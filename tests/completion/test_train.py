@@ -21,9 +21,9 @@ from completion.infer import load_completer
 from completion.losses import twin_loss
 from completion.models import build_model, default_spec, with_rgb
 from completion.models.classical import ClassicalCompleter
-from completion.objectives import Objective, pixel_weights, training_loss
 from completion.samples import Augmentation, StepBatches, disturb_image, draw_crop
 from completion.train import TrainProgress, TrainSettings, learning_rate, scales_at, train
+from completion.training_loss import Objective, pixel_weights, training_loss
 from completion.types import CompletedDepth, DepthFrame
 from tests.completion.scenes import Streets, street
 from tests.completion.training_run import settings

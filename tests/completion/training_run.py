@@ -13,9 +13,9 @@ from pathlib import Path
 import torch
 
 from completion.models import default_spec
-from completion.objectives import Objective, default_kind
 from completion.samples import Augmentation, TrainingSample
 from completion.train import TrainSettings, train
+from completion.training_loss import Objective, default_kind
 from tests.completion.scenes import Streets, street
 
 ARGUMENTS = {"twise": {"channels": 4}, "selection": {"width": 8}}

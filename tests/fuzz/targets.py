@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from hypothesis import strategies as st
 
-from pipeline.errors import DataError, UsageError
+from pipeline.base.errors import DataError, UsageError
 from tests.fuzz.mutations import mutated, png_files
 
 
@@ -60,7 +60,7 @@ def _label_samples() -> tuple[bytes, ...]:
 
 
 def _calibration_samples() -> tuple[bytes, ...]:
-    from pipeline.data.calibration import format_calibration
+    from pipeline.geometry.calibration import format_calibration
     from tests.pipeline.tiny_kitti import CALIBRATION
 
     text = format_calibration(CALIBRATION).encode()
@@ -86,7 +86,7 @@ def _cloud_samples(kind: str) -> tuple[bytes, ...]:
 
 
 def _config_samples() -> tuple[bytes, ...]:
-    from pipeline.config import built_in_folder
+    from pipeline.run_folder.config import built_in_folder
 
     return tuple(path.read_bytes() for path in sorted(built_in_folder().glob("*.yaml")))
 
@@ -137,7 +137,7 @@ def _read_label(path: Path) -> object:
 
 
 def _read_calibration(path: Path) -> object:
-    from pipeline.data.calibration import read_calibration
+    from pipeline.geometry.calibration import read_calibration
 
     calibration = read_calibration(path)
     with np.errstate(all="raise"):
@@ -163,7 +163,7 @@ def _read_cloud(path: Path) -> object:
 
 
 def _read_config(path: Path) -> object:
-    from pipeline.config import load_config
+    from pipeline.run_folder.config import load_config
 
     return load_config(path)
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from detection.kitti_format import parse_lines
+from pipeline.base.errors import UsageError
+from pipeline.base.paths import RunFolder, safe_id
 from pipeline.cli import main
-from pipeline.config import Config, load_config
-from pipeline.errors import UsageError
-from pipeline.paths import RunFolder, safe_id
+from pipeline.run_folder.config import Config, load_config
 from pipeline.stages import frame_stages_for
 from tests.pipeline.tiny_kitti import write_tiny_kitti
 
@@ -100,7 +100,7 @@ def test_a_data_set_without_any_label_cannot_be_evaluated(weights: Path, tmp_pat
 
 
 def test_a_random_network_is_never_used_silently(data: Path, tmp_path: Path, capsys, monkeypatch) -> None:
-    from pipeline import weights as embedded
+    from pipeline.run_folder import weights as embedded
 
     monkeypatch.setattr(embedded, "embedded_names", lambda room: [])
     options = ["--config", "kitti", "--data", str(data), "--out", str(tmp_path / "run"), "--stage", "detect"]

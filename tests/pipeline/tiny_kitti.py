@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from detection.kitti_format import KittiObject
-from pipeline.data.calibration import Calibration
 from pipeline.data.frame import Frame
 from pipeline.data.kitti_object import write_frame
+from pipeline.geometry.calibration import Calibration
 
 HEIGHT, WIDTH = 48, 96
 P2 = np.array([[70.0, 0, 48, 3], [0, 70, 20, 0.5], [0, 0, 1, 0.003]])

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from completion.types import CompletedDepth
-from pipeline.data.calibration import Calibration
+from pipeline.geometry.calibration import Calibration
 
 
 def back_project(depth: NDArray, calibration: Calibration, keep: NDArray) -> tuple[NDArray, NDArray]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.simulation.scenes import furniture, vegetation
-from pipeline.simulation.scenes.confusers import build_confuser
+from pipeline.simulation.scenes.distractors import build_confuser
 from pipeline.simulation.scenes.ground import Ground
 from pipeline.simulation.scenes.mesh import Part
 from pipeline.simulation.scenes.people import build_cyclist, build_pedestrian

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from detection.kitti_format import KittiObject
+from pipeline.base.errors import UsageError
 from pipeline.benchmark import mask_points
 from pipeline.benchmark.mask_points import PointCounts, count_points, mask_scores
 from pipeline.data import open_dataset
-from pipeline.data.calibration import Calibration
 from pipeline.data.frame import Frame
-from pipeline.errors import UsageError
+from pipeline.geometry.calibration import Calibration
 from pipeline.semantics.sources import open_semantics
-from pipeline.simulation.synth import SynthSettings, write_dataset
+from pipeline.simulation.synth import SynthSettings
+from pipeline.simulation.writers import write_dataset
 
 CAR = KittiObject("Car", 0.0, 0, 0.0, (0, 0, 9, 9), (1.5, 1.6, 4.0), (0.0, 1.5, 10.0), 0.0)
 REGION = KittiObject("DontCare", -1, -1, -10, (70, 0, 99, 49), (-1, -1, -1), (-1000, -1000, -1000), -10)

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.base.errors import UsageError
 from pipeline.check.doctor import check
 from pipeline.data import open_dataset
 from pipeline.data.depth_png import decode_depth, encode_depth, png_bytes
-from pipeline.errors import UsageError
 
 FRAMES = ("000001", "000002", "000003", "000004", "000007", "000008")
 VICTIM = "000003"

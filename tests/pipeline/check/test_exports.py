@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 
 from completion.types import CompletedDepth
+from pipeline.base.errors import DataError, UsageError
+from pipeline.base.paths import RunFolder
 from pipeline.check.doctor import check
 from pipeline.check.safe_pickle import load_infos
 from pipeline.data import open_dataset
 from pipeline.data.dataset import Dataset
-from pipeline.errors import DataError, UsageError
 from pipeline.export.export import export
 from pipeline.export.record import Options
-from pipeline.frame_files import FrameFiles
-from pipeline.paths import RunFolder
+from pipeline.run_folder.frame_outputs import FrameFiles
 
 FRAMES = ("000003", "000004", "000007")
 VICTIM = "000004"

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.base.errors import DataError, UsageError
 from pipeline.check.leakage import BUILT_IN, RawFrame, find_leakage, read_mapping, read_training
-from pipeline.errors import DataError, UsageError
 from tests.conftest import sample_folder
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.base.errors import DataError, UsageError
 from pipeline.data.dataset import Dataset
 from pipeline.data.frame import Frame
-from pipeline.errors import DataError, UsageError
 
 
 @pytest.fixture

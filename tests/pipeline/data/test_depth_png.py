@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.base.errors import DataError
 from pipeline.data.depth_png import decode_depth, encode_depth, read_depth_png, write_depth_png
-from pipeline.errors import DataError
 
 
 def test_codes_are_metres_times_256_rounded() -> None:

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.base.errors import DataError, UsageError
 from pipeline.data import open_dataset
-from pipeline.data.calibration import format_calibration
 from pipeline.data.cloud_files import Cloud, pcd_bytes, ply_bytes, read_cloud, read_points
-from pipeline.errors import DataError, UsageError
+from pipeline.geometry.calibration import format_calibration
 from tests.pipeline.tiny_kitti import CALIBRATION
 
 COLUMNS = ("x", "y", "z", "intensity", "source", "sigma")

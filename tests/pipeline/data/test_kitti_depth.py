@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.base.errors import DataError, MissingPart, UsageError
 from pipeline.data import open_dataset
 from pipeline.data.kitti_depth import cropped_frame, official_crop
-from pipeline.errors import DataError, MissingPart, UsageError
 
 DRIVE = "2011_09_26_drive_0001_sync"
 CAM_TO_CAM = (

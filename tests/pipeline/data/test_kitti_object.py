@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from detection.kitti_format import KittiObject
+from pipeline.base.errors import DataError, MissingPart, UsageError
 from pipeline.data import open_dataset
-from pipeline.data.calibration import Calibration
 from pipeline.data.frame import Frame
 from pipeline.data.kitti_object import read_labels, read_velodyne, write_frame, write_objects, write_velodyne
-from pipeline.errors import DataError, MissingPart, UsageError
+from pipeline.geometry.calibration import Calibration
 
 P2 = np.array([[100.0, 0, 40, 3], [0, 100, 20, 0.5], [0, 0, 1, 0.003]])
 # x forward, y left, z up -> x right, y down, z forward, 8 cm behind and 27 cm above the camera

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.base.errors import DataError, UsageError
 from pipeline.data import open_dataset
 from pipeline.data.nyuv2 import open_nyuv2, open_nyuv2_full, sample_depth
-from pipeline.errors import DataError, UsageError
 
 h5py = pytest.importorskip("h5py")
 

@@ -12,7 +12,8 @@ from detection.kitti_format import boxes_of
 from pipeline.check.doctor import check
 from pipeline.data import open_dataset
 from pipeline.data.vkitti2 import read_objects, thesis_split
-from pipeline.simulation.synth import SynthSettings, write_dataset
+from pipeline.simulation.synth import SynthSettings
+from pipeline.simulation.writers import write_dataset
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,10 @@ import pytest
 
 from detection.boxes import project_to_image
 from detection.kitti_format import boxes_of
+from pipeline.base.errors import DataError, UsageError
 from pipeline.data import open_dataset
 from pipeline.data.vkitti2 import camera_pose, read_objects, thesis_split
 from pipeline.data.vkitti2_difficulty import RULES, count_difficulties, difficulty
-from pipeline.errors import DataError, UsageError
 from tests.pipeline.data.vkitti2_tree import BASELINE, CARS, CX, CY, FOCAL, HEIGHT, WIDTH, write_tree
 
 

@@ -18,7 +18,7 @@ from pipeline.experiments import chapter_5, chapter_5_exact, chapter_5_figures, 
 from pipeline.experiments.catalogue import find
 from pipeline.experiments.chapter_5_findings import FINDINGS
 from pipeline.experiments.cloud_runs import picked_by_fps
-from pipeline.experiments.common_start import Mixture, start_inputs
+from pipeline.experiments.common_pretraining import Mixture, start_inputs
 from pipeline.experiments.detection_budget import DETECTION
 from pipeline.experiments.findings import markdown as findings_page
 from pipeline.experiments.intervals import HOLDS, PERHAPS, judge, margin

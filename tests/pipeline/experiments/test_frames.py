@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.base.errors import UsageError
 from pipeline.cli import main
 from pipeline.data import open_dataset
-from pipeline.errors import UsageError
 from pipeline.experiments.budgets import COMPLETION, CompletionBudget
 from pipeline.experiments.frames import ROWS, StoredFrame, ensure_frames, load, open_any
 from tests.pipeline.data.vkitti2_tree import write_tree

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from completion.types import CompletedDepth
+from pipeline.base.errors import UsageError
+from pipeline.base.settings import with_changes
 from pipeline.data import Dataset, Frame
-from pipeline.errors import UsageError
 from pipeline.experiments.chapter_5_exact import BLUR, MISALIGNED, exact_input
 from pipeline.experiments.cloud_cache import CloudCache, DepthCache
 from pipeline.experiments.detection_runs import DetectionRecipe
@@ -20,7 +21,6 @@ from pipeline.experiments.worlds import ThesisLevels, open_world, synthetic_fram
 from pipeline.pointcloud.semantic_mask import OBJECTS, object_score
 from pipeline.pointcloud.taxonomy import CLEAN, NOISE_INBET
 from pipeline.semantics.sources import TrueBoxes, TrueClasses
-from pipeline.settings import with_changes
 
 LIMIT = 200_000
 

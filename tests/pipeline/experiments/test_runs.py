@@ -122,7 +122,7 @@ def test_estimates_add_up_over_runs_and_count_data_once() -> None:
 
 
 def test_a_damaged_result_is_named(tmp_path: Path) -> None:
-    from pipeline.errors import UsageError
+    from pipeline.base.errors import UsageError
     from pipeline.experiments.chapter_2_3 import FIGURE_3_3
 
     recipe = FIGURE_3_3.rows[0].recipe
@@ -144,7 +144,7 @@ def test_a_damaged_result_is_named(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrong_configuration_is_named(tmp_path: Path, text: str, message: str) -> None:
-    from pipeline.errors import UsageError
+    from pipeline.base.errors import UsageError
 
     path = tmp_path / "c.yaml"
     path.write_text(text)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import UsageError
+from pipeline.base.errors import UsageError
 from pipeline.experiments import outputs
 from pipeline.experiments.catalogue import TABLES, find
 from pipeline.experiments.intervals import FAILS, HOLDS, PERHAPS, UNKNOWN, estimate, judge, kendall_tau, over_seeds

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from completion.types import CompletedDepth
+from pipeline.base.paths import RunFolder
 from pipeline.data import open_dataset
 from pipeline.data.dataset import Dataset
-from pipeline.frame_files import FrameFiles
-from pipeline.paths import RunFolder
+from pipeline.run_folder.frame_outputs import FrameFiles
 from tests.pipeline.tiny_kitti import write_tiny_kitti
 
 

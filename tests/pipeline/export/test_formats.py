@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.base.errors import UsageError
 from pipeline.check.safe_pickle import load_infos
-from pipeline.errors import UsageError
 from pipeline.export.export import Summary, export
 from pipeline.export.formats import FORMATS
 from pipeline.export.record import Options
@@ -308,7 +308,7 @@ def test_the_verb(tiny_run: TinyRun, tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 def test_calibration_survives_the_text_file(tiny_run: TinyRun, tmp_path: Path) -> None:
-    from pipeline.data.calibration import read_calibration
+    from pipeline.geometry.calibration import read_calibration
 
     exported(tiny_run, tmp_path, "openpcdet")
     read = read_calibration(tmp_path / "training" / "calib" / "000000.txt")

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.export.disk_buffer import Spool, write_streamed
 from pipeline.export.pickles import item_opcodes, write_dict_of_lists, write_list
-from pipeline.export.spool import Spool, write_streamed
 from pipeline.export.workers import default_workers, map_ordered
 
 

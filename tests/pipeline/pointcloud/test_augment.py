@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from completion.types import CompletedDepth
-from pipeline.errors import UsageError
+from pipeline.base.errors import UsageError
 from pipeline.pointcloud.augment import PRESETS, AugmentSettings, augment_frame, preset
 from pipeline.pointcloud.columns import expected_error
 from pipeline.pointcloud.grid_sampling import GridSampling

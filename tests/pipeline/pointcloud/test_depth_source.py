@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.errors import DataError
+from pipeline.base.errors import DataError
 from pipeline.pointcloud.depth_source import read_depth_folder
 from pipeline.pointcloud.pseudo_sigma import pseudo_sigma
 from pipeline.pointcloud.sigma_filter import SigmaBand, sigma_filter

@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from completion.types import CompletedDepth
-from pipeline.data.calibration import Calibration, read_calibration
-from pipeline.data.projection import project_points
-from pipeline.errors import DataError
-from pipeline.pointcloud.backproject import back_project
-from pipeline.pointcloud.clouds import DenseCloud
+from pipeline.base.errors import DataError
+from pipeline.geometry.back_project import back_project
+from pipeline.geometry.calibration import Calibration, read_calibration
+from pipeline.geometry.clouds import DenseCloud
+from pipeline.geometry.in_view import lidar_pixels
+from pipeline.geometry.project import project_points
 from pipeline.pointcloud.depth_sampling import back_project_and_sample
 from pipeline.pointcloud.grid_sampling import GridSampling, grid_sample, grid_sampling
-from pipeline.pointcloud.lidar_pixels import lidar_pixels
 from pipeline.pointcloud.radius_gather import Radii, radius_gather
 from pipeline.pointcloud.range_image import RangeGrid, range_sample
 from pipeline.pointcloud.semantic_mask import SemanticMask, object_score, semantic_mask

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.paths import RunFolder
+from pipeline.base.paths import RunFolder
 from tests.pipeline.report.scored import write_run
 
 

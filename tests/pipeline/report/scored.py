@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from completion.types import CompletedDepth
-from pipeline.config import load_config
+from pipeline.base.paths import RunFolder
 from pipeline.data import open_dataset
-from pipeline.frame_files import FrameFiles
-from pipeline.paths import RunFolder
 from pipeline.pointcloud.augment import AugmentedCloud
 from pipeline.report.page import write_report
-from pipeline.scoring import evaluate_run
+from pipeline.run_folder.config import load_config
+from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.scoring.scores import evaluate_run
 from tests.pipeline.tiny_kitti import write_tiny_kitti
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.base.paths import RunFolder
 from pipeline.data.kitti_object import read_labels, write_objects
-from pipeline.paths import RunFolder
 from tests.pipeline.report.scored import score_and_report
 
 # What a reader does, and what the page then says of itself, written into the end of the page.

@@ -7,11 +7,11 @@ import base64
 import numpy as np
 import pytest
 
+from pipeline.base.paths import RunFolder
 from pipeline.data import open_dataset
-from pipeline.frame_files import FrameFiles
-from pipeline.paths import RunFolder
 from pipeline.report import cloud as clouds
 from pipeline.report.hover import NOTHING, hover_grid, hover_step
+from pipeline.run_folder.frame_outputs import FrameFiles
 
 
 def random_cloud(measured: int, completed: int) -> clouds.FrameCloud:

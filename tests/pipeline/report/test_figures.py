@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.config import load_config
+from pipeline.base.paths import RunFolder
 from pipeline.data import open_dataset
-from pipeline.paths import RunFolder
 from pipeline.report import panels
 from pipeline.report.figures import write_figures
-from pipeline.report.judged import judge
-from pipeline.viewers.scene import BOX_COLOURS, Scene, SceneBox, scenes
+from pipeline.report.matches import judge
+from pipeline.report.recordings.scene import BOX_COLOURS, Scene, SceneBox, scenes
+from pipeline.run_folder.config import load_config
 
 
 def drawn(run: RunFolder, kind: str) -> list[Path]:
@@ -77,7 +77,7 @@ def test_boxes_of_a_scene_are_in_the_lidar_frame(recorded: list[Scene]) -> None:
 
 def test_an_mcap_file_reads_back(recorded: list[Scene], tmp_path: Path) -> None:
     reading = pytest.importorskip("mcap.reader", reason="mcap (extra viewer) is not installed")
-    from pipeline.viewers.mcap_file import TOPICS, write_mcap
+    from pipeline.report.recordings.mcap_file import TOPICS, write_mcap
 
     path = write_mcap(tmp_path / "run.mcap", recorded, "run")
     with open(path, "rb") as file:
@@ -103,7 +103,7 @@ def test_messages_are_foxgloves_own(recorded: list[Scene]) -> None:
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
     from google.protobuf.json_format import ParseDict
 
-    from pipeline.viewers.mcap_file import messages
+    from pipeline.report.recordings.mcap_file import messages
 
     def spelled(value: Any) -> Any:
         """Times as protobuf's JSON has them."""
@@ -129,8 +129,8 @@ def test_messages_are_foxgloves_own(recorded: list[Scene]) -> None:
 
 
 def test_messages_hold_the_fields_of_their_schemas(recorded: list[Scene]) -> None:
-    from pipeline.viewers.mcap_file import TOPICS, messages
-    from pipeline.viewers.schemas import SCHEMAS
+    from pipeline.report.recordings.mcap_file import TOPICS, messages
+    from pipeline.report.recordings.schemas import SCHEMAS
 
     for topic, message in messages(recorded[0]):
         assert set(message) == set(SCHEMAS[TOPICS[topic]]["properties"])
@@ -139,7 +139,7 @@ def test_messages_hold_the_fields_of_their_schemas(recorded: list[Scene]) -> Non
 
 def test_an_rrd_file_is_written(recorded: list[Scene], tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="rerun-sdk (extra viewer) is not installed")
-    from pipeline.viewers.rerun_file import write_rrd
+    from pipeline.report.recordings.rerun_file import write_rrd
 
     path = write_rrd(tmp_path / "run.rrd", recorded, "run")
     data = path.read_bytes()

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from detection.kitti_format import KittiObject
-from pipeline.config import load_config
+from pipeline.base.paths import RunFolder
 from pipeline.data import open_dataset
-from pipeline.paths import RunFolder
 from pipeline.report import pictures
 from pipeline.report.boxes import footprint, wireframe
 from pipeline.report.page import spread
-from pipeline.report.tables import markdown_table, number
-from pipeline.scoring import evaluate_run, mean_of, mean_steps
+from pipeline.run_folder.config import load_config
+from pipeline.scoring.scores import evaluate_run, mean_of, mean_steps
+from pipeline.scoring.tables import markdown_table, number
 from tests.pipeline.report.scored import score_and_report
 from tests.pipeline.tiny_kitti import CALIBRATION
 

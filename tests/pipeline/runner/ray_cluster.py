@@ -12,7 +12,7 @@ import signal
 import sys
 from pathlib import Path
 
-from pipeline.config import Config
+from pipeline.run_folder.config import Config
 from pipeline.runner import batch
 from pipeline.runner.jobs import Outcome, Task
 from pipeline.runner.worker import FrameWorker

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.base.seeds import derive_seed
 from pipeline.data.frame import Frame
-from pipeline.frame_files import content_hash
+from pipeline.run_folder.frame_outputs import content_hash
 from pipeline.runner.keys import code_version, part_hash, stage_key, task_key
-from pipeline.runner.seeds import derive_seed
 
 
 def file_hash(path: Path) -> str:

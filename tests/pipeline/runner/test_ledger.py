@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import DataError, UsageError
-from pipeline.frame_files import Written, content_hash
+from pipeline.base.errors import DataError, UsageError
+from pipeline.run_folder.frame_outputs import Written, content_hash
 from pipeline.runner.jobs import Outcome, Task, crashed, outcome_of_error
 from pipeline.runner.ledger import Ledger, all_failures
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from pipeline.errors import UsageError
+from pipeline.base.errors import UsageError
 from pipeline.runner.jobs import Outcome, Task
 from pipeline.runner.processes import LocalEngine
 from pipeline.runner.signals import stop_on_signals

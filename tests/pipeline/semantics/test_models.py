@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from completion.train import TrainProgress
-from pipeline.errors import DataError
+from pipeline.base.errors import DataError
 from pipeline.semantics import training
 from pipeline.semantics.network import NetworkSegmenter, StreetSegmenter, load_segmenter, save_segmenter
 from pipeline.semantics.onnx_model import OnnxSegmenter

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from detection.kitti_format import KittiObject
+from pipeline.base.errors import DataError, MissingPart, UsageError
 from pipeline.data.frame import Frame
-from pipeline.errors import DataError, MissingPart, UsageError
 from pipeline.semantics.conventions import CONVENTIONS, to_train_ids
 from pipeline.semantics.sources import boxes_to_semantics, open_semantics
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.data.projection import project_points
+from pipeline.geometry.project import project_points
+from pipeline.geometry.rings import split_rings, subsample_rows
 from pipeline.simulation.lidar import MAX_RANGE, beam_directions, scan, sensor
-from pipeline.simulation.lidar_rows import split_rings, subsample_rows
 from pipeline.simulation.scenes import surfaces as S
 from pipeline.simulation.scenes.mesh import assemble, cylinder, quad
 from pipeline.simulation.scenes.surfaces import CAR, GLASS_CAR, Surface, Texture

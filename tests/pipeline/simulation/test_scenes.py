@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.simulation.scenes import surfaces as S
-from pipeline.simulation.scenes.confusers import CONFUSERS, Builder, build_confuser
+from pipeline.simulation.scenes.distractors import CONFUSERS, Builder, build_confuser
 from pipeline.simulation.scenes.furniture import bins, clutter, fence, phone_box, skip, traffic_light, trailer, wall
 from pipeline.simulation.scenes.ground import Road
 from pipeline.simulation.scenes.layouts import LAYOUTS, draw_scene

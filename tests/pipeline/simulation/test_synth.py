@@ -12,12 +12,13 @@ import pytest
 
 from pipeline.data import open_dataset
 from pipeline.data.depth_png import read_depth_png
-from pipeline.data.writers.kitti_depth import drives, pseudo_ground_truth
-from pipeline.data.writers.vkitti2 import scene_lengths
 from pipeline.simulation.semi_dense import PoseNoise, accumulate, consistent, stereo_depth
 from pipeline.simulation.sequence import simulate_sequence
 from pipeline.simulation.statistics import describe, describe_folder, plot, table
-from pipeline.simulation.synth import SyntheticFrame, SynthSettings, simulate_frame, write_dataset
+from pipeline.simulation.synth import SyntheticFrame, SynthSettings, simulate_frame
+from pipeline.simulation.writers import write_dataset
+from pipeline.simulation.writers.kitti_depth import drives, pseudo_ground_truth
+from pipeline.simulation.writers.vkitti2 import scene_lengths
 
 
 def _files(root: Path) -> list[str]:

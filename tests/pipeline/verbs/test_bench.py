@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.cli import main
-from pipeline.simulation.synth import SynthSettings, write_dataset
+from pipeline.simulation.synth import SynthSettings
+from pipeline.simulation.writers import write_dataset
 
 BENCH = ["--stage", "bench", "--suite", "real", "--rows", "16", "--completers", "nearest"]
 

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.cli import STAGE_HELP, main
+from pipeline.cli import main
 from pipeline.verbs import VERBS
 from pipeline.verbs.env import EXTRAS, environment, remarks
+from pipeline.verbs.parsers import STAGE_HELP
 from pipeline.verbs.shell import script
 
 

@@ -1,0 +1,1 @@
+"""Executors and kernels for inference on a CPU."""

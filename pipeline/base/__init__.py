@@ -1,0 +1,1 @@
+"""What everything uses: atomic files, seeds, errors, settings, paths, versions, progress."""

@@ -1,0 +1,1 @@
+"""Each geometric question answered once: calibration, projection, back-projection, in view, rings."""

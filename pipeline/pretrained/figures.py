@@ -1,0 +1,146 @@
+"""Figures of networks on held-out synthetic frames, as they stand on the cards of the embedded weights."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from detection.kitti_format import KittiObject
+from pipeline.benchmark.car_recall import car_recall
+from pipeline.data import Dataset
+from pipeline.geometry.project import project_points
+from pipeline.geometry.rings import subsample_rows
+
+ROWS = (64, 32, 16, 8)
+# Share of right cars that the score threshold in a card is chosen for.
+PRECISION = 0.8
+AT_THRESHOLD = "car, BEV IoU 0.7, hard"
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Frames to measure on, and for detectors the clouds they are given: a preset and its completion."""
+
+    dataset: Dataset
+    cloud: str = "L"
+    completer: str = "classical"
+
+    def figures(self, room: str, weights: Path) -> dict[str, Any]:
+        """The figures of a card, and which frames they are from."""
+        if room == "completion":
+            found = completion_figures(weights, self.dataset)
+        elif room == "detection":
+            found = detection_figures(weights, self)
+        else:
+            found = segmentation_figures(weights, self.dataset)
+        return {**self.which, **found}
+
+    @cached_property
+    def which(self) -> dict[str, Any]:
+        """How many frames these are, and a hash of their ids and labels that tells them from others."""
+        content = [(frame.id, [str(label) for label in frame.labels]) for frame in self.dataset]
+        return {"frames": len(content), "labels": hashlib.sha256(repr(content).encode()).hexdigest()[:12]}
+
+
+def completion_figures(weights: Path, dataset: Dataset) -> dict[str, Any]:
+    """Errors on dense truth by LiDAR rows: `completion.diagnostics.diagnose` (mm, %), mean over frames."""
+    from completion.diagnostics import diagnose
+    from completion.infer import load_completer
+    from completion.types import DepthFrame
+
+    completer = load_completer(str(weights), backend="auto")
+    figures: dict[str, Any] = {}
+    for rows in ROWS:
+        frames = (
+            DepthFrame(
+                frame.image,
+                project_points(subsample_rows(frame.points, 64 // rows), frame.calibration, frame.image_size),
+                frame.target_depth,
+            )
+            for frame in dataset
+        )
+        figures[f"{rows} rows"] = {key: round(value, 4) for key, value in diagnose(completer, frames).items()}
+    return figures
+
+
+def detection_figures(weights: Path, held_out: HeldOut) -> dict[str, Any]:
+    """The score threshold of cars at 64 rows (see `operating_point`), and AP; recall and precision there at 16 too."""
+    labels, found = detections(weights, held_out, 64)
+    chosen = operating_point(labels, found)
+    few = detections(weights, held_out, 16)
+    return {
+        AT_THRESHOLD: chosen,
+        f"{AT_THRESHOLD}, 16 rows": recall_at(*few, chosen["threshold"]),
+        "ap_r40": average_precision(labels, found),
+        "ap_r40, 16 rows": average_precision(*few),
+    }
+
+
+Objects = list[list[KittiObject]]
+
+
+def detections(weights: Path, held_out: HeldOut, rows: int) -> tuple[Objects, Objects]:
+    """Labels and detections of all frames, their clouds made from so many LiDAR rows."""
+    from completion.infer import load_completer
+    from detection.infer import load_detector
+    from detection.results import result_objects
+    from detection.types import PointFrame
+    from pipeline.benchmark.suite import DetectionRow, augmented_points
+
+    detector = load_detector(str(weights))
+    complete = load_completer(held_out.completer, backend="auto")
+    labels, found = [], []
+    for frame in held_out.dataset:
+        points = augmented_points(frame, DetectionRow(str(weights), held_out.cloud, rows, 0), complete)
+        camera = frame.calibration
+        seen = PointFrame(points, camera.T_cam_velo, camera.P2, frame.image_size, frame.id)
+        labels.append(frame.labels)
+        found.append(result_objects(detector.detect(seen), seen))
+    return labels, found
+
+
+def average_precision(labels: Objects, found: Objects) -> dict[str, list[float | None]]:
+    """AP R40 easy, moderate, hard by "CLASS METRIC IOU"; from above and in 3D."""
+    from detection.evaluation.kitti_ap import evaluate
+
+    return {
+        f"{row['class']} {row['metric']} {row['iou']}": [row["easy"], row["moderate"], row["hard"]]
+        for row in evaluate(labels, found)["results"]
+        if row["metric"] in ("bev", "3d")
+    }
+
+
+def operating_point(labels: Objects, found: Objects) -> dict[str, float]:
+    """The lowest score from which on `PRECISION` of the reported cars or more are cars (BEV, IoU 0.7); recall there."""
+    for threshold in np.arange(0.1, 0.96, 0.025):
+        if not recall_at(labels, found, float(threshold))["precision"] < PRECISION:
+            break
+    return recall_at(labels, found, round(float(threshold), 3))
+
+
+def recall_at(labels: Objects, found: Objects, threshold: float) -> dict[str, float]:
+    """Recall of cars up to "hard" and precision (BEV, IoU 0.7) of detections from this score on."""
+    report = car_recall(labels, found, iou=0.7, metric="bev", score_threshold=threshold)
+    return {"threshold": threshold, "recall": report.by_level["hard"].share, "precision": report.precision}
+
+
+def segmentation_figures(weights: Path, dataset: Dataset) -> dict[str, Any]:
+    """Share of pixels with the right class, and IoU of vehicles (car, truck, bus), over all frames."""
+    from pipeline.semantics.conventions import CLASSES, NONE
+    from pipeline.semantics.network import load_segmenter
+
+    segmenter = load_segmenter(weights)
+    vehicles = [CLASSES.index(name) for name in ("car", "truck", "bus")]
+    right = counted = both = either = 0
+    for frame in dataset:
+        found, known = segmenter.segment(frame.image), frame.semantics != NONE
+        right += int((found == frame.semantics)[known].sum())
+        counted += int(known.sum())
+        ours, theirs = np.isin(found, vehicles) & known, np.isin(frame.semantics, vehicles)
+        both, either = both + int((ours & theirs).sum()), either + int((ours | theirs).sum())
+    return {"pixel_accuracy": round(right / max(counted, 1), 4), "vehicle_iou": round(both / max(either, 1), 4)}

@@ -1,0 +1,229 @@
+"""The one place that reads YAML: configuration files, `--set` overrides, and the resolved copy beside the results.
+
+Sections named after a library (`synth`, `augment`, `train`) pass their other keys on to that library's own settings;
+`pipeline.base.settings.with_changes` checks them there, so that no name is written down twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from pipeline.base.errors import UsageError
+from pipeline.base.settings import nearest_name
+
+MAX_CONFIG_BYTES = 1_000_000
+
+
+class Section(BaseModel):
+    """A section whose keys are all listed here."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+
+
+class LibrarySection(BaseModel):
+    """A section whose other keys belong to a library's settings and are checked there."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, validate_default=True)
+
+    @property
+    def library(self) -> dict[str, Any]:
+        """The keys for the library."""
+        return dict(self.__pydantic_extra__ or {})
+
+
+class DataConfig(Section):
+    """Where frames come from."""
+
+    name: str = Field(default="synthetic", description="kitti_object, ..., or synthetic (made by the synth stage)")
+    root: str | None = Field(default=None, description="folder of the data set; synthetic data defaults to OUT/data")
+    frames: str | None = Field(default=None, description="a:b (positions), a split file, or ids separated by commas")
+
+
+class SynthConfig(LibrarySection):
+    """Synthetic scenes; other keys: `pipeline.simulation.synth.SynthSettings`."""
+
+
+class CompletionConfig(Section):
+    """Depth completion."""
+
+    model: str = Field(default="classical", description="embedded weights by name, a checkpoint file, or 'classical'")
+    backend: str = "torch"
+    device: str = "cpu"
+
+
+class AugmentConfig(LibrarySection):
+    """The point-cloud stage; other keys change fields of the preset (`pipeline.pointcloud.presets`)."""
+
+    preset: str = Field(default="L_D_F", description="L, D, D_F, D_SF, L_D_SF, L_D_SF_mask, ...")
+    semantics: str | None = Field(
+        default=None, description="object masks: truth, boxes, files:FOLDER, network[:WEIGHTS], onnx:FILE, hf:FOLDER"
+    )
+    convention: str | None = Field(default=None, description="label convention of masks in files or of an ONNX model")
+    depth_from: str | None = Field(
+        default=None, description="folder of uint16 depth PNGs (ID.png) used instead of completion"
+    )
+
+
+class DetectionConfig(Section):
+    """The 3D detector."""
+
+    model: str = Field(default="auto", description="embedded weights by name, a checkpoint file, or 'auto' (by preset)")
+    device: str = "cpu"
+
+
+class EvaluationConfig(Section):
+    """KITTI AP."""
+
+    classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist")
+    recall: Literal[40, 11] = 40
+    iou_set: Literal["strict", "loose", "both"] = "strict"
+
+
+class ReportConfig(Section):
+    """The HTML report."""
+
+    frames: int = Field(default=20, ge=1, le=500, description="frames shown in detail")
+    compare: str | None = Field(default=None, description="folder of another run over the same frames")
+    format: Literal["html", "png", "pdf", "svg", "rrd", "mcap"] = Field(
+        default="html", description="further output beside the page: figures, or recordings for Rerun and Foxglove"
+    )
+
+
+class TrainConfig(LibrarySection):
+    """Training; other keys: the `TrainSettings` of the network's library."""
+
+    network: Literal["completion", "detection", "segmentation"] = "completion"
+    # Every n-th LiDAR ring, e.g. [1, 2, 4, 8]. Completion draws n for every crop; detection sees every frame once with
+    # each n. None: the frame's sparse map, the run's clouds.
+    row_steps: tuple[int, ...] = ()
+    # With row_steps: standard deviation in degrees of a random rotation between LiDAR and camera.
+    calibration_jitter: float = 0.0
+
+
+class RunConfig(Section):
+    """How the work is done; nothing here changes a result."""
+
+    workers: int = Field(default=0, ge=0, le=1024, description="processes; 0 = one per core")
+    keep_free_gb: float = Field(default=0.5, ge=0, description="stop before the disk has less than this left")
+    max_gb: float | None = Field(default=None, gt=0, description="stop when this run's files exceed this")
+    keep_going: bool = Field(default=True, description="process the other frames when one fails")
+
+
+class Config(Section):
+    """A whole run."""
+
+    seed: int = Field(default=1, ge=0, lt=2**31)
+    data: DataConfig = DataConfig()
+    synth: SynthConfig = SynthConfig()
+    completion: CompletionConfig = CompletionConfig()
+    augment: AugmentConfig = AugmentConfig()
+    detection: DetectionConfig = DetectionConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
+    report: ReportConfig = ReportConfig()
+    train: TrainConfig = TrainConfig()
+    run: RunConfig = RunConfig()
+    made_with: dict[str, str | None] | None = Field(
+        default=None, description="versions and git commit, written by the program"
+    )
+
+
+def load_config(source: str | Path | None, overrides: Iterable[str] = ()) -> Config:
+    """The configuration of a file with `key.sub=value` overrides applied.
+
+    source  a YAML file; None for the built-in demo. `configs/NAME.yaml` and `NAME` find the built-in file of that name
+            when there is no such file, so that an installed package has them without a checkout
+    Raises UsageError naming the unknown key (with the nearest known one) or the value that does not fit.
+    """
+    path = config_path(source)
+    tree = _read_yaml(path)
+    for text in overrides:
+        _override(tree, text)
+    return parse_config(tree, str(path))
+
+
+def parse_config(tree: Mapping[str, Any], where: str) -> Config:
+    """A checked Config from plain values; `where` names the file in messages."""
+    try:
+        return Config.model_validate(tree)
+    except ValidationError as error:
+        raise UsageError(f"{where}: {_explain(error)}") from None
+
+
+def config_path(source: str | Path | None) -> Path:
+    """The file meant by `source`; see `load_config`."""
+    if source is None:
+        return built_in_folder() / "synthetic.yaml"
+    path = Path(source)
+    if path.is_file():
+        return path
+    built_in = built_in_folder() / f"{path.stem}.yaml"
+    if str(path) in (path.stem, f"configs/{path.stem}.yaml") and built_in.is_file():
+        return built_in
+    names = ", ".join(sorted(file.stem for file in built_in_folder().glob("*.yaml")))
+    raise UsageError(f"no such configuration file: {path} (built in: {names})")
+
+
+def built_in_folder() -> Path:
+    """The folder of the files that come with the program: configs/ of the checkout, pipeline/configs once installed."""
+    package = Path(__file__).resolve().parent.parent
+    installed = package / "configs"
+    return installed if installed.is_dir() else package.parent / "configs"
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > MAX_CONFIG_BYTES:
+            raise UsageError(f"{path}: expected a configuration file, got {path.stat().st_size / 1e6:.1f} MB")
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise UsageError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise UsageError(f"{path}: expected 'section:' lines, got {type(tree).__name__}")
+    return tree
+
+
+def _override(tree: dict[str, Any], text: str) -> None:
+    """Sets one `key.sub=value` in the tree; the value is typed as YAML types it (1, 0.5, true, null, [a, b], text)."""
+    name, equals, value = text.partition("=")
+    keys = name.strip().split(".")
+    if not equals or not all(keys):
+        raise UsageError(f"--set {text}: expected key.sub=value, for example synth.frames=40")
+    for key in keys[:-1]:
+        inner = tree.get(key)
+        if inner is None:
+            inner = tree[key] = {}
+        if not isinstance(inner, dict):
+            raise UsageError(f"--set {text}: {key} is a value, not a section")
+        tree = inner
+    try:
+        tree[keys[-1]] = yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise UsageError(f"--set {text}: {value!r} is not valid YAML") from None
+
+
+def _explain(error: ValidationError) -> str:
+    """The first problem of a validation, with the nearest name for an unknown key."""
+    problem = error.errors()[0]
+    place = [str(part) for part in problem["loc"]]
+    name = ".".join(place)
+    if problem["type"] == "extra_forbidden":
+        section: type[BaseModel] = Config
+        for part in place[:-1]:
+            section = section.model_fields[part].annotation  # type: ignore[assignment]
+        return f"unknown key {name}; {nearest_name(place[-1], section.model_fields)}"
+    message = problem["msg"][:1].lower() + problem["msg"][1:]
+    return f"{name}: {message}, got {problem['input']!r}"
+
+
+def dump_config(config: Config) -> str:
+    """YAML text of the resolved configuration; `load_config` reads it back."""
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)

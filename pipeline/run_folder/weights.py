@@ -1,0 +1,70 @@
+"""Which weight files a run uses: embedded ones by name, or the user's by path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeline.base.errors import UsageError
+from pipeline.run_folder.config import Config
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+
+
+def embedded_folder(room: str) -> Path:
+    """The folder of the weights that come with `completion` or `detection`."""
+    return ROOT / room / "weights"
+
+
+def embedded_names(room: str) -> list[str]:
+    """Names of the embedded weights of a room."""
+    return sorted(path.stem for path in embedded_folder(room).glob("*.safetensors"))
+
+
+def completion_weights(config: Config) -> tuple[Path, ...]:
+    """Weights and card of the completion network; nothing for the classical method."""
+    name = config.completion.model
+    return () if name == "classical" else _files("completion", name, "completion.model", also="classical")
+
+
+def detection_weights(config: Config) -> tuple[Path, ...]:
+    """Weights and card of the detector."""
+    return _files("detection", detector_name(config), "detection.model")
+
+
+def detector_name(config: Config) -> str:
+    """The detector asked for; 'auto' takes the embedded one trained on this preset's kind of cloud.
+
+    Embedded detectors are named NETWORK_lidar (preset L) and NETWORK_augmented (all others).
+    """
+    name = config.detection.model
+    if name != "auto":
+        return name
+    names = embedded_names("detection")
+    if not names:
+        raise UsageError(
+            "no detector weights are embedded in this version: train one (--stage train --set train.network=detection) "
+            "and give it as detection.model; a network with random weights is never used"
+        )
+    ending = "_lidar" if config.augment.preset == "L" else "_augmented"
+    return next((name for name in names if name.endswith(ending)), names[0])
+
+
+def mask_weights(source: str) -> tuple[Path, ...]:
+    """Files of the segmentation model that `augment.semantics` names: network[:WEIGHTS], onnx:FILE, hf:FOLDER."""
+    kind, _, place = source.partition(":")
+    if kind == "network":
+        return _files("pipeline/semantics", place or "street-small", "augment.semantics")
+    if kind == "onnx":
+        return (Path(place),)
+    if kind == "hf":
+        return tuple(sorted(path for path in Path(place).rglob("*") if path.is_file()))
+    return ()
+
+
+def _files(room: str, name: str, key: str, also: str = "") -> tuple[Path, ...]:
+    """The .safetensors and the card of a path or an embedded name. Raises UsageError listing what there is."""
+    for path in (Path(name), Path(name).with_suffix(".safetensors"), embedded_folder(room) / f"{name}.safetensors"):
+        if path.is_file():
+            return path, path.with_suffix(".json")
+    known = ", ".join([also, *embedded_names(room)] if also else embedded_names(room)) or "none"
+    raise UsageError(f"{key}: no weights called {name!r} (no such file; embedded: {known})")

@@ -1,0 +1,1 @@
+"""Scores of a run: metrics.json and its tables."""

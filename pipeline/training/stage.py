@@ -1,0 +1,175 @@
+"""The train stage: frames of a data set as samples of the libraries' own training loops; weights in OUT/weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.base.errors import DataError, UsageError
+from pipeline.base.paths import RunFolder
+from pipeline.base.progress import duration
+from pipeline.base.settings import plain, with_changes
+from pipeline.base.versions import made_with
+from pipeline.data import Dataset, Frame
+from pipeline.run_folder.config import Config
+from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.stages import cloud_of, open_frames
+from pipeline.training.beam_subsampling import RowDrawing
+
+if TYPE_CHECKING:
+    from completion.samples import TrainingSample
+    from completion.train import TrainProgress as DepthProgress
+    from completion.types import DepthFrame
+    from detection.kitti_format import KittiObject
+    from detection.train import LabelledFrames
+    from detection.train import TrainProgress as DetectionProgress
+    from detection.types import PointFrame
+
+
+@dataclass(frozen=True)
+class DepthSamples:
+    """Frames with true depth, as `completion.train` reads them; picklable for its worker processes."""
+
+    dataset: Dataset
+    row_steps: tuple[int, ...] = ()
+    calibration_jitter: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    def __getitem__(self, index: int, /) -> DepthFrame | TrainingSample:
+        from completion.samples import TrainingSample
+        from completion.types import DepthFrame
+
+        frame = self.dataset[index]
+        camera = frame.calibration.K if frame.has("calibration") else None
+        sample = DepthFrame(frame.image, frame.sparse_depth, frame.target_depth, camera)
+        if not self.row_steps:
+            return sample
+        return TrainingSample(sample, RowDrawing.of(frame, self.row_steps, self.calibration_jitter))
+
+
+@dataclass(frozen=True)
+class CloudSamples:
+    """Labelled clouds (raw LiDAR, or the run's augmented clouds), as `detection.train` reads them."""
+
+    dataset: Dataset
+    config: Config
+    run: RunFolder
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    def __getitem__(self, index: int, /) -> tuple[PointFrame, list[KittiObject]]:
+        from detection.types import PointFrame
+
+        frame = self.dataset[index]
+        points = cloud_of(self.config, frame, FrameFiles(self.run, frame.id))
+        camera = frame.calibration
+        return PointFrame(points, camera.T_cam_velo, camera.P2, frame.image_size, frame.id), frame.labels
+
+
+@dataclass(frozen=True)
+class MaskSamples:
+    """Frames with class maps, as `pipeline.semantics.training` reads them."""
+
+    dataset: Dataset
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    def __getitem__(self, index: int, /) -> Frame:
+        return self.dataset[index]
+
+
+def cloud_samples(dataset: Dataset, config: Config, run: RunFolder) -> LabelledFrames:
+    """The run's clouds, or with `train.row_steps` clouds of so many rows made for training alone."""
+    if not config.train.row_steps:
+        return CloudSamples(dataset, config, run)
+    from pipeline.training.thinned_clouds import ThinnedClouds
+
+    return ThinnedClouds(dataset, config, run)
+
+
+def train_stage(config: Config, run: RunFolder) -> Path:
+    """Trains, or continues to train, the network of the configuration; returns its weights."""
+    dataset = open_frames(config, run)
+    out = run.weights / config.train.network
+    print(f"training the {config.train.network} network on {len(dataset)} frames; state, log and weights: {out}")
+    try:
+        if config.train.network == "completion":
+            return train_completion(config, dataset, out)
+        if config.train.network == "segmentation":
+            return train_segmentation(config, dataset, out)
+        if not dataset[0].has("labels"):
+            raise UsageError(f"{dataset.root}: frame {dataset.ids[0]} has no label to train detection on")
+        return train_detection(config, cloud_samples(dataset, config, run), out)
+    except DataError:
+        raise
+    except ValueError as error:
+        raise UsageError(f"train: {error}") from None
+
+
+def train_completion(config: Config, dataset: Dataset, out: Path) -> Path:
+    """`completion.train` on frames with true depth; the run's seed unless the section has its own."""
+    from completion.models import default_spec
+    from completion.train import TrainSettings, train
+    from completion.training_loss import Objective, default_kind
+
+    if not dataset[0].has("target_depth"):
+        raise UsageError(f"{dataset.root}: frame {dataset.ids[0]} has no true depth to train completion on")
+    changes = config.train.library
+    # Another architecture brings its own input scaling, which single keys may still change.
+    architecture = str(changes.get("model", {}).get("architecture", "twise"))
+    spec = default_spec(architecture)
+    base = TrainSettings(spec, Objective(default_kind(spec)), seed=config.seed)
+    settings = with_changes(base, changes, "train")
+    held_back = min(settings.validation_frames, len(dataset) // 10) if settings.validate_every else 0
+    count = len(dataset) - held_back
+    samples = DepthSamples(dataset.select(dataset.ids[:count]), config.train.row_steps, config.train.calibration_jitter)
+    validation = [_validation_frame(dataset[frame_id], config) for frame_id in dataset.ids[count:]]
+    facts = training_facts(config)
+    return train(settings, samples, out, validation=validation, facts=facts, progress=print_progress)
+
+
+def _validation_frame(frame: Frame, config: Config) -> DepthFrame:
+    """A held-back frame; with `row_steps`, at 16 rows of 64 and without jitter, so that figures of runs compare."""
+    from completion.types import DepthFrame
+
+    sparse = RowDrawing.of(frame, (4,), 0.0)(np.random.default_rng(0)) if config.train.row_steps else frame.sparse_depth
+    return DepthFrame(frame.image, sparse, frame.target_depth)
+
+
+def train_detection(config: Config, samples: LabelledFrames, out: Path) -> Path:
+    """`detection.train` on labelled clouds."""
+    from detection.train import TrainSettings, train
+
+    settings = with_changes(TrainSettings(seed=config.seed), config.train.library, "train")
+    return train(settings, samples, out, config.detection.device, print_progress)
+
+
+def train_segmentation(config: Config, dataset: Dataset, out: Path) -> Path:
+    """`pipeline.semantics.training.train_segmenter` on frames with class maps."""
+    from pipeline.semantics.training import SegmentationSettings, train_segmenter
+
+    if not dataset[0].has("semantics"):
+        raise UsageError(f"{dataset.root}: frame {dataset.ids[0]} has no class map to train segmentation on")
+    settings = with_changes(SegmentationSettings(seed=config.seed), config.train.library, "train")
+    out.mkdir(parents=True, exist_ok=True)
+    samples: Any = MaskSamples(dataset)
+    return train_segmenter(samples, out / "model", settings, print_progress)
+
+
+def print_progress(progress: DepthProgress | DetectionProgress) -> None:
+    """A line with the losses and the time that is left."""
+    losses = "  ".join(f"{name} {value:.3g}" for name, value in progress.losses.items())
+    left = f"  about {duration(progress.eta_seconds)} left" if progress.step < progress.steps else ""
+    print(f"step {progress.step} of {progress.steps}  {losses}{left}", flush=True)
+
+
+def training_facts(config: Config) -> dict[str, Any]:
+    """What goes into the card of the weights."""
+    return {"data": plain(config.data.model_dump()), "synth": plain(config.synth.library), "made_with": made_with()}
