@@ -3,7 +3,7 @@
     python -m benchmarks.completion --threads 2
 
 TWISE with 64 channels has no trained weights here: its last layers are fitted to closed-form streets (`street_twise`),
-so that outputs are depths in metres. It and the embedded network are timed and scored on other streets with truth.
+so that outputs are depths in metres. It and the bundled network are timed and scored on other streets with truth.
 """
 
 from __future__ import annotations
@@ -209,14 +209,14 @@ def mae(completer: NetworkCompleter, frames: list[DepthFrame]) -> float:
     return float(np.mean(errors))
 
 
-def embedded_measures(name: str, repeats: int, limits: dict[str, float]) -> list[Measure]:
-    """The embedded network on whole frames: torch, the automatic backend, int8."""
+def bundled_measures(name: str, repeats: int, limits: dict[str, float]) -> list[Measure]:
+    """The bundled network on whole frames: torch, the automatic backend, int8."""
     model, card = load_checkpoint(name)
     spec: ModelSpec = card.model
     frames = streets(4, first=1)
 
     def completer(convolutions: Callable[..., Tensor] | None) -> NetworkCompleter:
-        return NetworkCompleter(model, spec, read_out=card.read_out, convolutions=convolutions)
+        return NetworkCompleter(model, spec, decoding=card.decoding, convolutions=convolutions)
 
     ways: dict[str, Callable[..., Tensor] | None] = {OWN: own_kernels(model), "torch, channels last": None}
     if find_spec("onnx") and find_spec("onnxruntime"):
@@ -227,10 +227,10 @@ def embedded_measures(name: str, repeats: int, limits: dict[str, float]) -> list
     ours = calls.pop(OWN)
     reference = calls["torch, channels last"]()
     exact = {label: call for label, call in calls.items() if label != "int8"}
-    row = compare("embedded completer, 375x1242", ours, exact, repeats, nearly_everywhere)
+    row = compare("bundled completer, 375x1242", ours, exact, repeats, nearly_everywhere)
     table = [row]
     if "int8" in calls:
-        table.append(compare("embedded completer, 375x1242, int8", calls["int8"], {OWN: ours}, repeats))
+        table.append(compare("bundled completer, 375x1242, int8", calls["int8"], {OWN: ours}, repeats))
     print(format_table(table))
     difference = 1e3 * np.abs(ours() - reference)
     print(
@@ -255,11 +255,11 @@ def embedded_measures(name: str, repeats: int, limits: dict[str, float]) -> list
 
 
 def coefficient_measures(name: str, repeats: int) -> list[Measure]:
-    """The embedded Depth Coefficients network on a whole frame: our pass and the tensor operations it repeats."""
+    """The bundled Depth Coefficients network on a whole frame: our pass and the tensor operations it repeats."""
     model, card = load_checkpoint(name)
     ways = {OWN: own_kernels(model), "torch, channels last": None}
     runs = {
-        label: NetworkCompleter(model, card.model, read_out=card.read_out, convolutions=way)
+        label: NetworkCompleter(model, card.model, decoding=card.decoding, convolutions=way)
         for label, way in ways.items()
     }
     frame = streets(1, first=1)[0]
@@ -296,7 +296,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--quick", action="store_true", help="small sizes: whether it runs, not how fast")
-    parser.add_argument("--network", default="selection_small", help="embedded network")
+    parser.add_argument("--network", default="selection_small", help="bundled network")
     parser.add_argument("--json")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
@@ -307,7 +307,7 @@ def main() -> None:
     )
     channels, size = (8, (96, 320)) if options.quick else (64, (352, 1216))
     measures = twise_measures(channels, size, options.repeats, limits)
-    measures += embedded_measures(options.network, options.repeats if options.quick else 9, limits)
+    measures += bundled_measures(options.network, options.repeats if options.quick else 9, limits)
     measures += coefficient_measures("dc_small", options.repeats)
     save(options.json, measures)
 

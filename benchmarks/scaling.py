@@ -68,7 +68,7 @@ def point_curves(sizes: Sequence[int], repeats: int) -> list[Curve]:
 
 
 def detector_curve(sizes: Sequence[int], repeats: int) -> Curve:
-    """The embedded LiDAR detector over the points of a scan."""
+    """The bundled LiDAR detector over the points of a scan."""
     detector = load_detector("small_lidar")
     calibration = kitti_calibration()
 

@@ -55,7 +55,7 @@ TARGETS = (
     Target("SPEED", "TWISE-64, 352x1216, fp32", 2.0, EAGER),
     Target("SPEED", FASTEST, 3.0, EAGER),
     Target("SPEED", LOSS, 1.0, ""),
-    Target("SPEED", "embedded completer, 375x1242", 0.150, ""),
+    Target("SPEED", "bundled completer, 375x1242", 0.150, ""),
     Target("SPEED", "complete + augment + detect, 2 workers", 2.0, ""),
     Target("CLOUD", "four steps, nearest", 5.0),
     Target("CLOUD", "four steps, first", 5.0),

@@ -24,7 +24,7 @@ from completion.models import ModelSpec, build_model, default_spec
 from completion.samples import Augmentation, StepBatches
 from completion.train import TrainSettings as DepthSettings
 from completion.train import train as train_depth
-from completion.training_loss import Objective, default_kind, training_loss
+from completion.training_loss import LossSettings, default_kind, training_loss
 from detection.models import layers
 from detection.train import Trainer, TrainSettings, collate, prepare_sample, training_scene
 from detection.types import PointFrame
@@ -87,14 +87,14 @@ def detection_measure(clouds: Clouds, steps: int, points: int) -> Measure:
 
 
 def completion_measure(dataset: Dataset, steps: int, crop: tuple[int, int]) -> Measure:
-    """The embedded completion network on crops: `train`, and the obvious loop."""
+    """The bundled completion network on crops: `train`, and the obvious loop."""
     samples = DepthSamples(dataset)
     spec = default_spec("selection")
-    objective = Objective(default_kind(spec))
+    loss_settings = LossSettings(default_kind(spec))
     augmentation = Augmentation(crop=crop)
     warm = 2  # steps that are timed apart: first calls, and what a run costs once
-    ours = _trained(spec, objective, samples, augmentation, warm + steps)
-    ours -= _trained(spec, objective, samples, augmentation, warm)
+    ours = _trained(spec, loss_settings, samples, augmentation, warm + steps)
+    ours -= _trained(spec, loss_settings, samples, augmentation, warm)
     batches = StepBatches(samples, augmentation, 0, 2, 1, 1, 0, 1)
     loading = timed(lambda step: batches[step], 0, steps)
     model = build_model(spec).train()
@@ -104,23 +104,23 @@ def completion_measure(dataset: Dataset, steps: int, crop: tuple[int, int]) -> M
         sparse, rgb, target = batches[step][0]
         optimiser.zero_grad()
         outputs = model(sparse / spec.depth_unit, scale_rgb(rgb, spec.rgb))
-        training_loss(outputs, sparse, target, spec, objective, (1.0, 1.0, 1.0), 0.0)["loss"].backward()
+        training_loss(outputs, sparse, target, spec, loss_settings, (1.0, 1.0, 1.0), 0.0)["loss"].backward()
         optimiser.step()
 
     timed(obvious, 0, warm)
     theirs = timed(obvious, warm, steps)
     print(f"completion, data and augmentation: {100 * loading / ours:.1f} % of a run without loader processes\n")
     return Measure(
-        "training of the embedded completer", 2 * steps / ours, "samples/s", {"obvious loop": 2 * steps / theirs}
+        "training of the bundled completer", 2 * steps / ours, "samples/s", {"obvious loop": 2 * steps / theirs}
     )
 
 
 def _trained(
-    spec: ModelSpec, objective: Objective, samples: DepthSamples, augmentation: Augmentation, steps: int
+    spec: ModelSpec, loss_settings: LossSettings, samples: DepthSamples, augmentation: Augmentation, steps: int
 ) -> float:
     """Seconds of a run of `train`."""
     settings = DepthSettings(
-        spec, objective, augmentation, epochs=10_000, max_steps=steps, batch=2, accumulate=1, log_every=steps
+        spec, loss_settings, augmentation, epochs=10_000, max_steps=steps, batch=2, accumulate=1, log_every=steps
     )
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()

@@ -20,7 +20,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import nn
 
-from completion.decoding import default_read_out
+from completion.decoding import default_decoding
 from completion.importers import import_checkpoint, import_with_spec
 from completion.models import ModelSpec, build_model
 from completion.state_dicts import CheckpointError, fill, match
@@ -43,13 +43,13 @@ class Card:
     """What a checkpoint is.
 
     model      how to rebuild the network and scale its inputs
-    read_out   how one depth is read from the output by default (see twin_surface.READ_OUTS; "all" or "peak" for DC)
+    decoding   how one depth is read from the output by default (see twin_surface.DECODINGS; "all" or "peak" for DC)
     training   free facts: data, seeds, command, hours, metrics, limits, or the source of imported weights
     sha256     of the safetensors file
     """
 
     model: ModelSpec
-    read_out: str = "fused"
+    decoding: str = "fused"
     training: Mapping[str, Any] = field(default_factory=dict)
     sha256: str = ""
 
@@ -74,7 +74,7 @@ def save_checkpoint(path: str | Path, model: nn.Module, card: Card) -> Path:
         "format": FORMAT,
         "sha256": hashlib.sha256(content).hexdigest(),
         "model": asdict(card.model),
-        "read_out": card.read_out,
+        "decoding": card.decoding,
         "training": dict(card.training),
     }
     write_atomically(weights_path, content)
@@ -83,14 +83,14 @@ def save_checkpoint(path: str | Path, model: nn.Module, card: Card) -> Path:
 
 
 def find_weights(path_or_name: str | Path) -> Path:
-    """The .safetensors file of a path (suffix optional) or of an embedded name. CheckpointError if there is none."""
+    """The .safetensors file of a path (suffix optional) or of a bundled name. CheckpointError if there is none."""
     given = Path(path_or_name)
     for candidate in (given.with_suffix(".safetensors"), WEIGHTS / f"{path_or_name}.safetensors"):
         if candidate.is_file():
             return candidate
-    embedded = ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none"
+    bundled = ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none"
     raise CheckpointError(
-        f"{path_or_name}: no such weights; give the path of a .safetensors file or one of: classical, {embedded}"
+        f"{path_or_name}: no such weights; give the path of a .safetensors file or one of: classical, {bundled}"
     )
 
 
@@ -104,7 +104,9 @@ def read_card(weights_path: Path) -> Card:
         if content["format"] != FORMAT:
             raise CheckpointError(f"{path}: expected format {FORMAT!r}, got {content['format']!r}")
         spec = ModelSpec(**content["model"])
-        return Card(spec, str(content["read_out"]), dict(content["training"]), str(content["sha256"]))
+        # Cards written before version 0.2 say "read_out".
+        decoding = content["decoding"] if "decoding" in content else content["read_out"]
+        return Card(spec, str(decoding), dict(content["training"]), str(content["sha256"]))
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, CheckpointError):
             raise
@@ -152,4 +154,4 @@ def _fitting_model(spec: ModelSpec, tensors: Mapping[str, torch.Tensor], path: P
 def convert_checkpoint(path: str | Path, architecture: str, out: str | Path) -> Path:
     """Import a published file (see `import_checkpoint`) and write it with a card; returns the safetensors path."""
     model, spec, facts = import_with_spec(path, architecture)
-    return save_checkpoint(out, model, Card(spec, default_read_out(spec), facts))
+    return save_checkpoint(out, model, Card(spec, default_decoding(spec), facts))

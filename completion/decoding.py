@@ -7,13 +7,13 @@ from torch import Tensor
 from completion.depth_coefficients import decode_logits
 from completion.mixture import expected_depth, twin_surfaces
 from completion.models import ModelSpec
-from completion.twin_surface import READ_OUTS, fuse, split_head
+from completion.twin_surface import DECODINGS, fuse, split_head
 
 # A mixture is read by its median, by its mean, or by its twin surfaces as TWISE is.
-MIXTURE_READ_OUTS = ("median", "expected", *READ_OUTS)
-READ_OUTS_OF = {
-    "twin": READ_OUTS,
-    "mixture": MIXTURE_READ_OUTS,
+MIXTURE_DECODINGS = ("median", "expected", *DECODINGS)
+DECODINGS_OF = {
+    "twin": DECODINGS,
+    "mixture": MIXTURE_DECODINGS,
     "coefficients": ("all", "peak"),
     "depth": ("depth",),
 }
@@ -21,44 +21,44 @@ READ_OUTS_OF = {
 Maps = tuple[Tensor, Tensor | None, Tensor | None, Tensor | None]
 
 
-def default_read_out(spec: ModelSpec) -> str:
+def default_decoding(spec: ModelSpec) -> str:
     """Return "fused" for two surfaces, "all" for Depth Coefficients, "depth" for one channel, "median" of a mixture."""
     return {"mixture": "median", "twin": "fused", "coefficients": "all", "depth": "depth"}[spec.output]
 
 
-def require_read_out(spec: ModelSpec, read_out: str) -> None:
+def require_decoding(spec: ModelSpec, decoding: str) -> None:
     """ValueError when a network's output cannot be read this way."""
-    allowed = READ_OUTS_OF[spec.output]
-    if read_out not in allowed:
+    allowed = DECODINGS_OF[spec.output]
+    if decoding not in allowed:
         raise ValueError(
-            f"read_out: a network with output {spec.output!r} offers {', '.join(allowed)}, got {read_out!r}"
+            f"decoding: a network with output {spec.output!r} offers {', '.join(allowed)}, got {decoding!r}"
         )
 
 
-def read_output(output: Tensor, spec: ModelSpec, read_out: str) -> Maps:
+def decode_output(output: Tensor, spec: ModelSpec, decoding: str) -> Maps:
     """(B, C, h, w) full-resolution output -> depth, foreground, background, sigma, each (B, h, w) in metres, or None.
 
-    read_out  two surfaces: one of `twin_surface.READ_OUTS`; Depth Coefficients: "all" or "peak" (three coefficients);
-              one channel: "depth"; mixture: one of MIXTURE_READ_OUTS.
+    decoding  two surfaces: one of `twin_surface.DECODINGS`; Depth Coefficients: "all" or "peak" (three coefficients);
+              one channel: "depth"; mixture: one of MIXTURE_DECODINGS.
     Raises ValueError when it does not fit the network's output.
     """
-    require_read_out(spec, read_out)
+    require_decoding(spec, decoding)
     if spec.output == "mixture":
-        return _read_mixture(output.float(), read_out)
+        return _read_mixture(output.float(), decoding)
     if spec.output == "twin":
         foreground, background, sigma = split_head(output.float(), spec.depth_unit)
-        return fuse(foreground, background, sigma, read_out), foreground, background, sigma
+        return fuse(foreground, background, sigma, decoding), foreground, background, sigma
     if spec.output == "depth":
         return output[:, 0].float().clamp(min=0) * spec.depth_unit, None, None, None
-    return decode_logits(output.float(), spec.bins, read_out), None, None, None
+    return decode_logits(output.float(), spec.bins, decoding), None, None, None
 
 
-def _read_mixture(mixture: Tensor, read_out: str) -> Maps:
+def _read_mixture(mixture: Tensor, decoding: str) -> Maps:
     foreground, background, sigma, median = (part[:, 0] for part in twin_surfaces(mixture))
-    if read_out == "median":
+    if decoding == "median":
         depth = median
-    elif read_out == "expected":
+    elif decoding == "expected":
         depth = expected_depth(mixture)[:, 0]
     else:
-        depth = fuse(foreground, background, sigma, read_out)
+        depth = fuse(foreground, background, sigma, decoding)
     return depth, foreground, background, sigma

@@ -21,14 +21,14 @@ def edge_mask(target: FloatMap, window: int = 5) -> NDArray[np.bool_]:
     return (target > 0) & (largest - smallest > 1) & (largest > 1.1 * smallest)
 
 
-def measured_region(frame: DepthFrame, deepest: float = 80.0) -> FloatMap:
-    """Target (H, W) with 0 where a LiDAR says nothing: beyond `deepest` metres, and above its topmost sample nearby.
+def measured_region(frame: DepthFrame, max_depth: float = 80.0) -> FloatMap:
+    """Target (H, W) with 0 where a LiDAR says nothing: beyond `max_depth` metres, and above its topmost sample nearby.
 
-    A frame without samples keeps all its target up to `deepest`. ValueError without a target.
+    A frame without samples keeps all its target up to `max_depth`. ValueError without a target.
     """
     if frame.target is None:
         raise ValueError("expected a frame with a target")
-    target = np.where(frame.target <= deepest, frame.target, np.float32(0))
+    target = np.where(frame.target <= max_depth, frame.target, np.float32(0))
     if not (frame.sparse > 0).any():
         return target
     near = cv2.dilate((frame.sparse > 0).astype(np.uint8), np.ones((1, 33), np.uint8))

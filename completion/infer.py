@@ -21,7 +21,7 @@ from completion.checkpoints import load_checkpoint
 from completion.cpu.pixel_unet import PixelUNetKernels
 from completion.cpu.ring_coefficients import complete_coefficients
 from completion.cpu.selection import complete_mixture
-from completion.decoding import Maps, read_output, require_read_out
+from completion.decoding import Maps, decode_output, require_decoding
 from completion.inputs import scale_rgb
 from completion.models import ModelSpec
 from completion.models.classical import ClassicalCompleter
@@ -42,7 +42,7 @@ class Completer(Protocol):
 class NetworkCompleter:
     """A network with its input scaling, on one device. Any image size: padded at the top and right, cut back after.
 
-    read_out      see `completion.decoding`
+    decoding      see `completion.decoding`
     rows          predict the bottom `rows` rows only (published protocols: 352, 256), 0 elsewhere; None: full height
     convolutions  computes the network's convolutions in its place (see `completion.backends`); None: torch does
     """
@@ -52,14 +52,14 @@ class NetworkCompleter:
         model: nn.Module,
         spec: ModelSpec,
         device: str | torch.device = "cpu",
-        read_out: str = "fused",
+        decoding: str = "fused",
         rows: int | None = None,
         convolutions: Convolutions | None = None,
     ) -> None:
-        require_read_out(spec, read_out)
+        require_decoding(spec, decoding)
         self.device = torch.device(device)
         self.model = model.to(device=self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
-        self.spec, self.read_out, self.rows, self.convolutions = spec, read_out, rows, convolutions
+        self.spec, self.decoding, self.rows, self.convolutions = spec, decoding, rows, convolutions
 
     def complete(
         self, sparse: FloatMap, image: NDArray[np.uint8], K: NDArray[np.float64] | None = None
@@ -94,7 +94,7 @@ class NetworkCompleter:
             return self._run_selection(self.model, sparse, rgb)
         if isinstance(self.convolutions, PixelUNetKernels):
             return self._run_coefficients(self.convolutions, sparse, rgb), None, None, None
-        return read_output(self._network_output(sparse, rgb), self.spec, self.read_out)
+        return decode_output(self._network_output(sparse, rgb), self.spec, self.decoding)
 
     def _network_output(self, sparse: Tensor, rgb: Tensor) -> Tensor:
         """(B, 1, h, w) metres, (B, 3, h, w) uint8 -> the finest output (B, C, h, w), of any size."""
@@ -116,7 +116,7 @@ class NetworkCompleter:
 
     def _run_selection(self, model: Selection, sparse: Tensor, rgb: Tensor) -> Maps:
         frames = [
-            complete_mixture(model, self.convolutions, one[0].numpy(), image.numpy(), self.spec.rgb, self.read_out)
+            complete_mixture(model, self.convolutions, one[0].numpy(), image.numpy(), self.spec.rgb, self.decoding)
             for one, image in zip(sparse, rgb.permute(0, 2, 3, 1))
         ]
         depth, foreground, background, sigma = (torch.from_numpy(np.stack(maps)) for maps in zip(*frames))
@@ -124,14 +124,14 @@ class NetworkCompleter:
 
     def _run_coefficients(self, kernels: PixelUNetKernels, sparse: Tensor, rgb: Tensor) -> Tensor:
         frames = [
-            complete_coefficients(self.spec.bins, kernels, one[0].numpy(), image.numpy(), self.spec.rgb, self.read_out)
+            complete_coefficients(self.spec.bins, kernels, one[0].numpy(), image.numpy(), self.spec.rgb, self.decoding)
             for one, image in zip(sparse, rgb.permute(0, 2, 3, 1))
         ]
         return torch.from_numpy(np.stack(frames))
 
 
 def load_completer(path_or_name: str | Path, device: str = "cpu", backend: str = "torch") -> Completer:
-    """The completer of a weights file, of an embedded name, or "classical" (no weights, no backend).
+    """The completer of a weights file, of a bundled name, or "classical" (no weights, no backend).
 
     ValueError for an unknown backend or one that cannot run this network there, ImportError without its packages,
     `checkpoints.CheckpointError` for weights that cannot be used.
@@ -142,4 +142,4 @@ def load_completer(path_or_name: str | Path, device: str = "cpu", backend: str =
         return ClassicalCompleter()
     model, card = load_checkpoint(path_or_name)
     convolutions = other_than_torch(model, card, device, backend)
-    return NetworkCompleter(model, card.model, device, card.read_out, convolutions=convolutions)
+    return NetworkCompleter(model, card.model, device, card.decoding, convolutions=convolutions)

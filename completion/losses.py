@@ -1,7 +1,7 @@
 """Masked losses of depth completion (thesis sections 3.3, 4.3, 4.4). Depth and error in any one unit.
 
 The cross-entropy of Depth Coefficients is `depth_coefficients.cross_entropy`; the sum over scales is
-`objectives.training_loss`.
+`training_loss.training_loss`.
 
 Every loss takes maps (B, 1, h, w) and per-pixel weights (0 where the target has no value), averages over the weighted
 pixels of each image and then over images; an image without valid pixels counts 0.

@@ -27,14 +27,14 @@ from completion.types import DepthFrame
 
 
 def quantised_completer(path_or_name: str | Path, frames: Sequence[DepthFrame]) -> NetworkCompleter:
-    """The completer of a weights file or embedded name with int8 convolutions.
+    """The completer of a weights file or bundled name with int8 convolutions.
 
     frames  sample frames; the ranges of all values inside the network are taken from them
     ValueError without frames or for a network that cannot be exported, ImportError without the extra `onnx`.
     """
     model, card = load_checkpoint(path_or_name)
     convolutions = quantised_convolutions(model, card.model, frames)
-    return NetworkCompleter(model, card.model, read_out=card.read_out, convolutions=convolutions)
+    return NetworkCompleter(model, card.model, decoding=card.decoding, convolutions=convolutions)
 
 
 def quantised_convolutions(model: nn.Module, spec: ModelSpec, frames: Sequence[DepthFrame]) -> Convolutions:
@@ -60,8 +60,8 @@ def network_inputs(model: nn.Module, spec: ModelSpec, frames: Sequence[DepthFram
         output: Tensor = model(*inputs)[0]
         return output
 
-    read_out = {"twin": "fused", "mixture": "median"}.get(spec.output, spec.output)
-    completer = NetworkCompleter(model, spec, read_out=read_out, convolutions=record)
+    decoding = {"twin": "fused", "mixture": "median"}.get(spec.output, spec.output)
+    completer = NetworkCompleter(model, spec, decoding=decoding, convolutions=record)
     for frame in frames:
         completer.complete(frame.sparse, frame.image, frame.K)
     return seen

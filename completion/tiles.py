@@ -31,7 +31,7 @@ class TiledCompleter(NetworkCompleter):
         model: nn.Module,
         spec: ModelSpec,
         device: str | torch.device = "cpu",
-        read_out: str = "peak",
+        decoding: str = "peak",
         rows: int | None = TILE_ROWS,
         tile_width: int = TILE_WIDTH,
     ) -> None:
@@ -41,7 +41,7 @@ class TiledCompleter(NetworkCompleter):
             )
         if tile_width < 1:
             raise ValueError(f"tile_width: expected at least one column, got {tile_width}")
-        super().__init__(model, spec, device, read_out, rows)
+        super().__init__(model, spec, device, decoding, rows)
         self.tile_width = tile_width
 
     def _network_output(self, sparse: Tensor, rgb: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from completion.checkpoints import Card, load_checkpoint, save_checkpoint
-from completion.decoding import default_read_out
+from completion.decoding import default_decoding
 from completion.diagnostics import diagnose
 from completion.growth import adopt, grow
 from completion.infer import NetworkCompleter
@@ -29,7 +29,7 @@ from completion.inputs import scale_rgb
 from completion.models import ModelSpec, build_model
 from completion.resume import load_state, save_state
 from completion.samples import Augmentation, Batch, SampleSource, StepBatches
-from completion.training_loss import Objective, fits, training_loss
+from completion.training_loss import LossSettings, fits, training_loss
 from completion.types import DepthFrame
 
 PRECISIONS = {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}
@@ -51,8 +51,8 @@ class TrainSettings:
     clip_gradient    largest norm of a step's gradient; 0: none
     scale_weights    (from epoch, weights of the outputs, finest first), ascending
     precision        "fp32", or "bf16" / "fp16" autocast on a GPU
-    read_out         how validation reads one depth from the output; "" for the usual one
-    warm_start       weights (a path or an embedded name) to begin with: of the same network, of a narrower one, or of
+    decoding         how validation reads one depth from the output; "" for the usual one
+    warm_start       weights (a path or a bundled name) to begin with: of the same network, of a narrower one, or of
                      another architecture with layers in common (its head stays as built)
     validate_every   steps between validations; 0: only at the end
     best_by          the validation figure that chooses the best checkpoint, lower is better
@@ -62,7 +62,7 @@ class TrainSettings:
     """
 
     model: ModelSpec
-    objective: Objective = field(default_factory=Objective)
+    loss: LossSettings = field(default_factory=LossSettings)
     augmentation: Augmentation = field(default_factory=Augmentation)
     seed: int = 0
     epochs: float = 30
@@ -79,7 +79,7 @@ class TrainSettings:
     clip_gradient: float = 0.0
     scale_weights: tuple[tuple[float, tuple[float, ...]], ...] = ((0, (1, 1, 1)), (10, (1, 0.1, 0.1)), (20, (1, 0, 0)))
     precision: str = "fp32"
-    read_out: str = ""
+    decoding: str = ""
     warm_start: str | None = None
     validate_every: int = 0
     validation_frames: int = 8
@@ -91,7 +91,7 @@ class TrainSettings:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        fits(self.objective, self.model)
+        fits(self.loss, self.model)
         if self.schedule not in ("halving", "cosine"):
             raise ValueError(f"schedule: expected 'halving' or 'cosine', got {self.schedule!r}")
         if self.precision not in PRECISIONS:
@@ -108,7 +108,7 @@ class TrainSettings:
         what = asdict(self)
         for free in ("max_steps", "validate_every", "validation_frames", "log_every", "checkpoint_steps"):
             del what[free]
-        for free in ("checkpoint_seconds", "workers", "best_by", "read_out"):
+        for free in ("checkpoint_seconds", "workers", "best_by", "decoding"):
             del what[free]
         if self.warm_start is None:
             del what["warm_start"]
@@ -312,7 +312,7 @@ class _Run:
             sparse,
             target,
             spec,
-            settings.objective,
+            settings.loss,
             scales_at(settings, step / self.steps_per_epoch),
             step / self.planned,
         )
@@ -362,11 +362,11 @@ class _Run:
         return self.seconds + time.monotonic() - self.begun
 
     @property
-    def read_out(self) -> str:
-        return self.settings.read_out or default_read_out(self.settings.model)
+    def decoding(self) -> str:
+        return self.settings.decoding or default_decoding(self.settings.model)
 
     def _completer(self) -> NetworkCompleter:
-        return NetworkCompleter(self.model, self.settings.model, self.device, self.read_out)
+        return NetworkCompleter(self.model, self.settings.model, self.device, self.decoding)
 
     def _card(self, step: int, facts: dict[str, Any]) -> Card:
         described = {
@@ -375,7 +375,7 @@ class _Run:
             "settings": asdict(self.settings),
             "torch": torch.__version__,
         }
-        return Card(self.settings.model, self.read_out, described | facts)
+        return Card(self.settings.model, self.decoding, described | facts)
 
 
 def _append(path: Path, row: dict[str, Any]) -> None:

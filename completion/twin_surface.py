@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 Array = TypeVar("Array", NDArray[np.floating], torch.Tensor)
 
 # Thesis Table 4.6: learned sigma, sigma = 1, sigma = 0, sigma = 1/2, and the choice of one surface by sigma > 1/2.
-READ_OUTS = ("fused", "foreground", "background", "mean", "hard")
+DECODINGS = ("fused", "foreground", "background", "mean", "hard")
 
 
 def split_head(output: torch.Tensor, depth_unit: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -25,23 +25,23 @@ def split_head(output: torch.Tensor, depth_unit: float) -> tuple[torch.Tensor, t
     return surfaces[:, 0], surfaces[:, 1], torch.sigmoid(output[:, 2])
 
 
-def fuse(foreground: Array, background: Array, sigma: Array, read_out: str = "fused") -> Array:
+def fuse(foreground: Array, background: Array, sigma: Array, decoding: str = "fused") -> Array:
     """One depth from two surfaces; all three of one shape, depth >= 0 in any unit.
 
-    read_out  "fused": sigma d1 + (1 - sigma) d2 (Eq. 4.5); "foreground": d1; "background": d2; "mean": their mean;
+    decoding  "fused": sigma d1 + (1 - sigma) d2 (Eq. 4.5); "foreground": d1; "background": d2; "mean": their mean;
               "hard": d1 where sigma > 0.5, else d2. ValueError for any other.
     """
-    if read_out not in READ_OUTS:
-        raise ValueError(f"read_out: expected one of {', '.join(READ_OUTS)}, got {read_out!r}")
+    if decoding not in DECODINGS:
+        raise ValueError(f"decoding: expected one of {', '.join(DECODINGS)}, got {decoding!r}")
     if foreground.shape != background.shape or foreground.shape != sigma.shape:
         raise ValueError(f"shapes differ: {foreground.shape}, {background.shape} and sigma {sigma.shape}")
-    if read_out == "foreground":
+    if decoding == "foreground":
         return foreground
-    if read_out == "background":
+    if decoding == "background":
         return background
-    if read_out == "mean":
+    if decoding == "mean":
         return (foreground + background) / 2
-    if read_out == "fused":
+    if decoding == "fused":
         return sigma * foreground + (1 - sigma) * background
     if isinstance(sigma, torch.Tensor):
         return torch.where(sigma > 0.5, foreground, background)

@@ -68,16 +68,16 @@ def save_checkpoint(model: nn.Module, preset: Preset, path: str | Path, facts: M
 
 
 def find_weights(path_or_name: str | Path) -> Path:
-    """A checkpoint file: an existing path, or the name of embedded weights (detection/weights/NAME.safetensors)."""
+    """A checkpoint file: an existing path, or the name of bundled weights (detection/weights/NAME.safetensors)."""
     path = Path(path_or_name)
     if path.is_file():
         return path
-    embedded = WEIGHTS / f"{path_or_name}.safetensors"
-    if embedded.is_file():
-        return embedded
+    bundled = WEIGHTS / f"{path_or_name}.safetensors"
+    if bundled.is_file():
+        return bundled
     names = ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none"
     raise ValueError(
-        f"{path_or_name}: expected a .safetensors file or the name of embedded weights (there are: {names})"
+        f"{path_or_name}: expected a .safetensors file or the name of bundled weights (there are: {names})"
     )
 
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from detection.boxes import wrap_angle
 from detection.checkpoints import import_checkpoint, load_checkpoint
 from detection.inputs import CameraCloud, camera_cloud, ground_height, lidar_input, mirrored, network_input
-from detection.lidar_inputs import all_points, from_turned
+from detection.lidar_inputs import all_points, from_camera_axes
 from detection.models.batch import DetectorModel, PointBatch, RawDetections
 from detection.models.openpcdet_pointrcnn import to_camera_axes
 from detection.models.presets import IMPORTED_PRESETS, OutputSettings, Preset
@@ -82,11 +82,11 @@ class Detector:
         # The last suppression looks at boxes from above in the LiDAR frame, where the network found them.
         turned = RawDetections(to_camera_axes(raw.boxes), raw.logits, raw.classes)
         found = final_detections([turned], self.preset.outputs, self.preset.classes)
-        return Detections(from_turned(found.boxes.values, frame), found.classes, found.scores)
+        return Detections(from_camera_axes(found.boxes.values, frame), found.classes, found.scores)
 
 
 def load_detector(path_or_name: str | Path, device: str = "cpu", seed: int = 0) -> Detector:
-    """A detector from our own weights: a .safetensors file with its card, or the name of embedded weights.
+    """A detector from our own weights: a .safetensors file with its card, or the name of bundled weights.
 
     Raises ValueError saying what is wrong with the file, or which names there are.
     """

@@ -19,10 +19,10 @@ from detection.types import Boxes3D, PointFrame
 Array = NDArray[np.float64]
 
 # Turned axes from LiDAR axes: x right = -y, y down = -z, z forward = x.
-_T_TURNED_VELO = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+_T_AXES_VELO = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
-def turned_cloud(frame: PointFrame) -> CameraCloud:
+def camera_axes_cloud(frame: PointFrame) -> CameraCloud:
     """Points inside the image and `LIDAR_AREA` (x and y; z is free) in turned axes, in the order of the frame."""
     keep = in_image(frame)
     for axis, (low, high) in enumerate(LIDAR_AREA):
@@ -31,19 +31,19 @@ def turned_cloud(frame: PointFrame) -> CameraCloud:
     return CameraCloud(np.stack([-points[:, 1], -points[:, 2], points[:, 0]], axis=1), points[:, 3:])
 
 
-def turned_boxes(boxes: Array, frame: PointFrame) -> Array:
+def camera_axes_boxes(boxes: Array, frame: PointFrame) -> Array:
     """(G, 7) boxes of the rectified camera -> camera form in turned axes."""
     lidar = to_lidar(Boxes3D(boxes), np.linalg.inv(frame.T_cam_velo).astype(np.float64))
-    return from_lidar(lidar, _T_TURNED_VELO).values
+    return from_lidar(lidar, _T_AXES_VELO).values
 
 
 def lidar_boxes(boxes: Array) -> Array:
     """(G, 7) camera form in turned axes -> x y z (centre) l w h heading in the LiDAR frame."""
-    return to_lidar(Boxes3D(boxes), _T_TURNED_VELO.T)
+    return to_lidar(Boxes3D(boxes), _T_AXES_VELO.T)
 
 
-def from_turned(boxes: Array, frame: PointFrame) -> Boxes3D:
-    """Inverse of `turned_boxes`."""
+def from_camera_axes(boxes: Array, frame: PointFrame) -> Boxes3D:
+    """Inverse of `camera_axes_boxes`."""
     return from_lidar(lidar_boxes(boxes), frame.T_cam_velo)
 
 
@@ -61,6 +61,6 @@ def lidar_rows(cloud: CameraCloud, height: NDArray[Any], features: Sequence[str]
 
 def all_points(frame: PointFrame, features: Sequence[str]) -> NDArray[np.float32]:
     """(N, 3 + len(features)) every visible point of a frame as the network takes it, in the order of the frame."""
-    cloud = turned_cloud(frame)
+    cloud = camera_axes_cloud(frame)
     height = ground_height(cloud.xyz) if "height" in features else np.zeros(len(cloud.xyz), np.float32)
     return lidar_rows(cloud, height, features)

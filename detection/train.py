@@ -21,7 +21,8 @@ import torch.distributed as dist
 from numpy.typing import NDArray
 from torch import Tensor
 
-from detection.augment import (
+from detection.checkpoints import load_checkpoint, load_tensors, save_checkpoint, save_tensors
+from detection.data_augmentation import (
     DatabaseObject,
     PasteSettings,
     SceneAugmentation,
@@ -30,10 +31,9 @@ from detection.augment import (
     cut_objects,
     paste_objects,
 )
-from detection.checkpoints import load_checkpoint, load_tensors, save_checkpoint, save_tensors
 from detection.inputs import CameraCloud, camera_cloud, ground_height, network_input, truth_boxes
 from detection.kitti_format import KittiObject, boxes_of
-from detection.lidar_inputs import lidar_boxes, lidar_rows, turned_boxes, turned_cloud
+from detection.lidar_inputs import camera_axes_boxes, camera_axes_cloud, lidar_boxes, lidar_rows
 from detection.models.added_classes import with_classes
 from detection.models.batch import DetectorModel, PointBatch
 from detection.models.layers import set_batchnorm_momentum
@@ -138,8 +138,8 @@ def training_scene(frame: PointFrame, labels: Sequence[KittiObject], preset: Pre
     obstacles = boxes_of([item for item in labels if item.type != "DontCare" and min(item.size) > 0]).values
     cloud, boxes = camera_cloud(frame), truth.boxes
     if preset.inputs.frame == "lidar":
-        cloud = turned_cloud(frame)
-        boxes, obstacles = turned_boxes(boxes, frame), turned_boxes(obstacles, frame)
+        cloud = camera_axes_cloud(frame)
+        boxes, obstacles = camera_axes_boxes(boxes, frame), camera_axes_boxes(obstacles, frame)
     points = np.concatenate([cloud.xyz, cloud.columns], axis=1)
     return TrainingScene(points, ground_height(cloud.xyz), boxes, truth.classes, obstacles)
 

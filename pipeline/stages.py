@@ -21,7 +21,7 @@ from pipeline.base.settings import nearest_name, plain, with_changes
 from pipeline.data import Dataset, Frame, open_dataset
 from pipeline.data.depth_png import read_depth_png
 from pipeline.run_folder.config import Config
-from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.run_folder.frame_outputs import FrameOutputs
 from pipeline.run_folder.weights import completion_weights, detection_weights, detector_name, mask_weights
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pipeline.pointcloud.presets import AugmentSettings
     from pipeline.semantics.sources import SemanticsSource
 
-FrameFunction = Callable[[Frame, FrameFiles], None]
+FrameFunction = Callable[[Frame, FrameOutputs], None]
 
 # The order of the work; asking for a stage runs what it needs before it.
 STAGES = ("synth", "train", "complete", "augment", "detect", "evaluate", "report")
@@ -68,7 +68,7 @@ def prepare_complete(config: Config) -> FrameFunction:
 
     completer = load_completer(config.completion.model, config.completion.device, config.completion.backend)
 
-    def complete(frame: Frame, files: FrameFiles) -> None:
+    def complete(frame: Frame, files: FrameOutputs) -> None:
         camera = frame.calibration.K if frame.has("calibration") else None
         if frame.has("points") and not frame.sparse_depth.any():
             where = next(iter(frame.files("points")), frame.where)
@@ -93,7 +93,7 @@ def prepare_augment(config: Config) -> FrameFunction:
     settings = augment_settings(config)
     masks = open_masks(config, settings)
 
-    def augment(frame: Frame, files: FrameFiles) -> None:
+    def augment(frame: Frame, files: FrameOutputs) -> None:
         completed = with_sigma(completed_depth(config, frame, files), settings)
         semantics = masks.semantics(frame) if masks is not None else None
         seed = derive_seed(config.seed, frame.id, "augment")
@@ -138,7 +138,7 @@ def open_masks(config: Config, settings: AugmentSettings) -> SemanticsSource | N
     return open_semantics(config.augment.semantics, config.augment.convention)
 
 
-def completed_depth(config: Config, frame: Frame, files: FrameFiles) -> CompletedDepth:
+def completed_depth(config: Config, frame: Frame, files: FrameOutputs) -> CompletedDepth:
     """Completed depth of this run, or of the folder `augment.depth_from`."""
     from completion.types import CompletedDepth
 
@@ -213,7 +213,7 @@ def prepare_detect(config: Config) -> FrameFunction:
     detector = load_detector(detector_name(config), config.detection.device, config.seed)
     raw = uses_raw_lidar(config)
 
-    def detect(frame: Frame, files: FrameFiles) -> None:
+    def detect(frame: Frame, files: FrameOutputs) -> None:
         camera = frame.calibration
         points = cloud_of(config, frame, files)
         cloud = PointFrame(points, camera.T_cam_velo, camera.P2, frame.image_size, frame.id)
@@ -229,7 +229,7 @@ def uses_raw_lidar(config: Config) -> bool:
     return config.augment.preset == "L" and not config.augment.library
 
 
-def cloud_of(config: Config, frame: Frame, files: FrameFiles) -> NDArray[np.float32]:
+def cloud_of(config: Config, frame: Frame, files: FrameOutputs) -> NDArray[np.float32]:
     """(N, 4 or 5 + C) float32 points for the detector, LiDAR frame."""
     return lidar_of(frame) if uses_raw_lidar(config) else files.read_cloud()
 
@@ -283,7 +283,7 @@ def frame_stages_for(stage: str, config: Config, has_points: bool = True) -> lis
 
     has_points  False for data sets without LiDAR (NYU, depth maps only): their depth is completed and nothing more
     """
-    trains_on_clouds = config.train.network == "detection" and not config.train.row_steps
+    trains_on_clouds = config.train.network == "detection" and not config.train.beam_strides
     last = {"synth": None, "train": "augment" if trains_on_clouds else None}.get(stage, "detect")
     if stage in FRAME_STAGES:
         last = stage

@@ -1,7 +1,7 @@
 """Writes the table "what accuracy to expect" into README.md and docs/index.md: python scripts/accuracy.py
 
 The figures come from docs/results/real.json (real KITTI frames: run_pipeline --stage bench --suite real) and from the
-cards of the embedded detectors (held-out synthetic frames). Run it whenever one of these has changed.
+cards of the bundled detectors (held-out synthetic frames). Run it whenever one of these has changed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from pipeline.run_folder.config import load_config  # noqa: E402
-from pipeline.run_folder.weights import detector_name, embedded_folder  # noqa: E402
+from pipeline.run_folder.weights import bundled_folder, detector_name  # noqa: E402
 
 PAGES = ("README.md", "docs/index.md")
 PLACE = re.compile(r"(<!-- accuracy[^>]*-->\n).*?(<!-- end -->)", re.DOTALL)
@@ -46,7 +46,7 @@ def table(real: dict[str, Any]) -> list[str]:
     names = detector_name(augmented), detector_name(raw)
     network = augmented.completion.model
     frames = f"{real['frames']} real KITTI frames"
-    rows = ["| measured | on | embedded networks | for comparison |", "|---|---|---|---|"]
+    rows = ["| measured | on | bundled networks | for comparison |", "|---|---|---|---|"]
     for count in (32, 16):
         ours, linear = depth_row(real, network, count), depth_row(real, "linear_inverse", count)
         if ours and linear:
@@ -89,7 +89,7 @@ def car_row(real: dict[str, Any], detector: str, rows: int) -> dict[str, Any] | 
 
 def held_out(detector: str) -> dict[str, Any]:
     """The figures on a detector's card."""
-    card: dict[str, Any] = json.loads((embedded_folder("detection") / f"{detector}.json").read_text())["held_out"]
+    card: dict[str, Any] = json.loads((bundled_folder("detection") / f"{detector}.json").read_text())["held_out"]
     return card
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from completion.cpu import winograd
-from completion.cpu.row_threads import SharedRows
+from completion.cpu.row_threads import RowThreads
 from completion.cpu.winograd import COARSER, NOTHING, RECTIFIED
 from completion.models.blocks import DepthDecoder, DepthEncoder, RgbEncoder
 from completion.models.hourglass import Hourglasses
@@ -30,7 +30,7 @@ Features = tuple[Float, ...]
 class _Pair:
     """Two convolutions in a row, which is what every step of the networks consists of (see `blocks`)."""
 
-    def __init__(self, block: nn.Sequential, kernels: SharedRows, name: str) -> None:
+    def __init__(self, block: nn.Sequential, kernels: RowThreads, name: str) -> None:
         first, second = (layer for layer in block if not isinstance(layer, nn.ReLU))
         self.kernels, self.name, self.channels = kernels, name, int(first.out_channels)  # type: ignore[arg-type]
         self.first, self.first_bias = _prepared(first), winograd.bias_of(first)
@@ -109,7 +109,7 @@ def _planes(x: Tensor) -> Float:
 
 
 class _RgbEncoder(nn.Module):
-    def __init__(self, block: RgbEncoder, kernels: SharedRows) -> None:
+    def __init__(self, block: RgbEncoder, kernels: RowThreads) -> None:
         super().__init__()
         self.steps = [_Pair(step, kernels, f"colour {name}") for name, step in block.named_children()]  # type: ignore[arg-type]
 
@@ -121,7 +121,7 @@ class _RgbEncoder(nn.Module):
 
 
 class _DepthEncoder(nn.Module):
-    def __init__(self, block: DepthEncoder, kernels: SharedRows, stage: int) -> None:
+    def __init__(self, block: DepthEncoder, kernels: RowThreads, stage: int) -> None:
         super().__init__()
         self.steps = [_Pair(step, kernels, f"{stage} {name}") for name, step in block.named_children()]  # type: ignore[arg-type]
 
@@ -134,7 +134,7 @@ class _DepthEncoder(nn.Module):
 
 
 class _DepthDecoder(nn.Module):
-    def __init__(self, block: DepthDecoder, kernels: SharedRows, stage: int, extra_skips: bool) -> None:
+    def __init__(self, block: DepthDecoder, kernels: RowThreads, stage: int, extra_skips: bool) -> None:
         super().__init__()
         steps = (block.dec2, block.dec1, block.prdct)
         self.dec2, self.dec1, self.predict = (
@@ -156,7 +156,7 @@ def convolutions(model: Hourglasses) -> Callable[[Tensor, Tensor], Tensor]:
     The weights are those at the time of this call. About 1 KB per pixel and 64 channels is held between frames
     (600 MB for 352x1216).
     """
-    kernels = SharedRows(torch.get_num_threads())
+    kernels = RowThreads(torch.get_num_threads())
     fast = copy.copy(model)
     fast._modules = {}
     fast.rgb_encoder = _RgbEncoder(model.rgb_encoder, kernels)  # type: ignore[assignment]

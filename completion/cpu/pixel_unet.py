@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from completion.cpu import winograd
-from completion.cpu.row_threads import SharedRows
+from completion.cpu.row_threads import RowThreads
 from completion.cpu.small_gemm import multiply, with_whole_lanes
 from completion.cpu.winograd import LINEAR, NOTHING, RECTIFIED, SAME
 from completion.models.selection import PixelUNet, Residual
@@ -32,7 +32,7 @@ class PixelUNetKernels:
 
     def __init__(self, network: PixelUNet, outputs: int | None = None) -> None:
         self.network = network
-        self.rows = SharedRows(torch.get_num_threads())
+        self.rows = RowThreads(torch.get_num_threads())
         self.lock = threading.Lock()
         self.stem = _winograd(network.stem)
         self.encoder = [[_residual(one) for one in stage.children()] for stage in network.encoder]

@@ -88,17 +88,17 @@ def _read_features(first, last, features, kernels, bias, rings, top, size, chann
 
 
 def complete_coefficients(
-    bins: Bins, convolutions: PixelUNetKernels, sparse: Float, image: NDArray[np.uint8], scaling: str, read_out: str
+    bins: Bins, convolutions: PixelUNetKernels, sparse: Float, image: NDArray[np.uint8], scaling: str, decoding: str
 ) -> Float:
     """Sparse (h, w) metres and image (h, w, 3) of any size -> depth (h, w).
 
     bins      with guard bins
     scaling   of the colours, see `inputs.scale_rgb`
-    read_out  "all" or "peak", see `depth_coefficients.decode`
+    decoding  "all" or "peak", see `depth_coefficients.decode`
     """
     inputs = unet_inputs(sparse, image, scaling, planes=False)
     depth = np.empty(sparse.shape, np.float32)
-    shape = np.float32(bins.size), bins.channels, read_out == "peak"
+    shape = np.float32(bins.size), bins.channels, decoding == "peak"
     with convolutions.lock:
         hidden = convolutions.before_head(inputs.features)
         in_threads(_read_features, len(sparse), hidden, *convolutions.head, inputs.rings, inputs.top, *shape, depth)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Float = NDArray[np.float32]
 
 
-class SharedRows:
+class RowThreads:
     """Runs kernels that release the interpreter on parts of their rows; holds maps by name."""
 
     def __init__(self, threads: int) -> None:

@@ -188,14 +188,14 @@ def complete_mixture(
     sparse: Float,
     image: NDArray[np.uint8],
     scaling: str,
-    read_out: str,
+    decoding: str,
 ) -> tuple[Float, Float, Float, Float]:
     """Sparse (h, w) metres and image (h, w, 3) of any size -> depth, foreground, background, sigma, each (h, w).
 
     convolutions  (1, 40, H/2, W/2) -> (1, 84, H/2, W/2), an export of `model.network.at_half` or our kernels; None:
                   that itself
     scaling       of the colours, see `inputs.scale_rgb`
-    read_out      one of `readout.MIXTURE_READ_OUTS`
+    decoding      one of `completion.decoding.MIXTURE_DECODINGS`
     """
     own = isinstance(convolutions, PixelUNetKernels)
     inputs = unet_inputs(sparse, image, scaling, planes=convolutions is not None and not own)
@@ -203,7 +203,7 @@ def complete_mixture(
     shares = np.array((low, 0.5, high), np.float32)
     out = np.empty((4, *sparse.shape), np.float32)
     shifts, residual = np.array(COLUMN_SHIFTS), np.float32(model.residual)
-    common = inputs.logs, inputs.top, shifts, residual, shares, read_out == "expected", out
+    common = inputs.logs, inputs.top, shifts, residual, shares, decoding == "expected", out
     if isinstance(convolutions, PixelUNetKernels):
         with convolutions.lock:
             hidden = convolutions.before_head(inputs.features)
@@ -214,6 +214,6 @@ def complete_mixture(
         assert head.shape[1] == 4 * CHANNELS, head.shape
         in_threads(_read_rows, len(sparse), head[0].float().permute(1, 2, 0).numpy(), *common)
     depth, foreground, background, sigma = out
-    if read_out not in ("median", "expected"):
-        depth = fuse(foreground, background, sigma, read_out)
+    if decoding not in ("median", "expected"):
+        depth = fuse(foreground, background, sigma, decoding)
     return depth, foreground, background, sigma

@@ -1,4 +1,4 @@
-"""Depth Coefficients on top of the two LiDAR rings round every pixel: the embedded DC network.
+"""Depth Coefficients on top of the two LiDAR rings round every pixel: the bundled DC network.
 
 The published networks get the coefficients of the sparse map and learn everything from there (thesis chapter 3). Here
 the two samples that enclose a pixel and the interpolation between them are written as coefficients first, a third each:

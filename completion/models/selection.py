@@ -1,4 +1,4 @@
-"""The embedded network: a distribution over a few measured depths at every pixel.
+"""The bundled network: a distribution over a few measured depths at every pixel.
 
 TWISE regresses two surfaces, which takes long training before they leave the mean of an edge. Here a compact U-Net says
 how likely each of ten candidates is: the sample above, the one below and the interpolation of the two, at the pixel

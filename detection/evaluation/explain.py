@@ -83,8 +83,8 @@ class _Story:
     def of(cls, matcher: Matcher, target: Target, level: int) -> _Story:
         labels, detections = matcher.pair.labels, matcher.pair.detections
         overlaps = matcher.overlaps(target.overlap)
-        rivals = matcher.rivalry(target, level)
-        match = match_all(rivals)
+        candidates = matcher.match_candidates(target, level)
+        match = match_all(candidates)
         taken_by = np.full(len(detections), -1, dtype=np.int64)
         taken_by[match[match >= 0]] = np.flatnonzero(match >= 0)
         pairs: dict[int, list[tuple[int, float]]] = {}
@@ -95,8 +95,8 @@ class _Story:
             matcher,
             target,
             level,
-            rivals.label_flag,
-            rivals.detection_flag,
+            candidates.label_flag,
+            candidates.detection_flag,
             match,
             taken_by,
             pairs,
@@ -221,10 +221,10 @@ def orientation_errors(matcher: Matcher, target: Target, level: int) -> tuple[fl
     None when nothing matches.
     """
     labels, detections = matcher.pair.labels, matcher.pair.detections
-    rivals = matcher.rivalry(target, level)
-    match = match_all(rivals)
-    rows = np.flatnonzero((match >= 0) & (rivals.label_flag == VALID))
-    rows = rows[rivals.detection_flag[match[rows]] == VALID]
+    candidates = matcher.match_candidates(target, level)
+    match = match_all(candidates)
+    rows = np.flatnonzero((match >= 0) & (candidates.label_flag == VALID))
+    rows = rows[candidates.detection_flag[match[rows]] == VALID]
     if len(rows) == 0:
         return None
     turn = labels.values[rows, ALPHA] - detections.values[match[rows], ALPHA]

@@ -47,7 +47,7 @@ class MatchRecords(NamedTuple):
     similarity: Array
 
 
-class Rivalry(NamedTuple):
+class MatchCandidates(NamedTuple):
     """What the matching looks at: who overlaps whom, who counts, and the scores (a tuple, as kernels take those).
 
     start, detection, iou, dontcare  as in `Overlaps`
@@ -66,14 +66,16 @@ class Rivalry(NamedTuple):
     score: Array
 
 
-def rivalry(overlaps: Overlaps, min_overlap: float, flags: tuple[Flags, Flags], scores: Array) -> Rivalry:
+def match_candidates(
+    overlaps: Overlaps, min_overlap: float, flags: tuple[Flags, Flags], scores: Array
+) -> MatchCandidates:
     """Overlaps, limit, flags of labels (G,) and detections (D,), and scores (D,) in one."""
     pairs = (overlaps.start, overlaps.detection, overlaps.iou, overlaps.dontcare)
-    return Rivalry(*pairs, float(min_overlap), *flags, scores)
+    return MatchCandidates(*pairs, float(min_overlap), *flags, scores)
 
 
 def record_matches(
-    label_offsets: Index, detection_offsets: Index, rivals: Rivalry, alphas: tuple[Array, Array]
+    label_offsets: Index, detection_offsets: Index, candidates: MatchCandidates, alphas: tuple[Array, Array]
 ) -> MatchRecords:
     """Run both passes on every frame.
 
@@ -82,10 +84,10 @@ def record_matches(
     """
     n_frames = len(label_offsets) - 1
     frames = np.repeat(np.arange(n_frames), np.diff(label_offsets))
-    n_labels = np.bincount(frames[rivals.label_flag == VALID], minlength=n_frames).astype(np.int64)
-    rows, tp_frame = _pass_a(label_offsets, rivals)
-    tp_score = rivals.score[rows]
-    score, frame, tp, fp, similarity = _pass_b_events(label_offsets, detection_offsets, rivals, *alphas)
+    n_labels = np.bincount(frames[candidates.label_flag == VALID], minlength=n_frames).astype(np.int64)
+    rows, tp_frame = _pass_a(label_offsets, candidates)
+    tp_score = candidates.score[rows]
+    score, frame, tp, fp, similarity = _pass_b_events(label_offsets, detection_offsets, candidates, *alphas)
     by_score, by_event = np.argsort(-tp_score, kind="stable"), np.argsort(-score, kind="stable")
     return MatchRecords(
         n_labels,
@@ -99,17 +101,17 @@ def record_matches(
     )
 
 
-def match_all(rivals: Rivalry) -> Index:
+def match_all(candidates: MatchCandidates) -> Index:
     """(G,) the detection row each label gets in pass B when every detection is admitted, -1 for none."""
-    match = np.full(len(rivals.label_flag), -1, dtype=np.int64)
-    taken = np.zeros(len(rivals.score), dtype=np.bool_)
+    match = np.full(len(candidates.label_flag), -1, dtype=np.int64)
+    taken = np.zeros(len(candidates.score), dtype=np.bool_)
     # A pair lies within one frame, so the labels of all frames can be walked at once.
-    _match_at(float(-np.finfo(np.float64).max), 0, len(match), rivals, taken, match)
+    _match_at(float(-np.finfo(np.float64).max), 0, len(match), candidates, taken, match)
     return match
 
 
 @kernel
-def _pass_a(label_offsets: Index, r: Rivalry) -> tuple[Index, Index]:
+def _pass_a(label_offsets: Index, r: MatchCandidates) -> tuple[Index, Index]:
     """Detection row and frame of every true positive when each label takes the highest score."""
     taken = np.zeros(len(r.score), dtype=np.bool_)
     rows = np.empty(len(r.label_flag), dtype=np.int64)
@@ -135,7 +137,9 @@ def _pass_a(label_offsets: Index, r: Rivalry) -> tuple[Index, Index]:
 
 
 @kernel
-def _match_at(threshold: float, first: int, last: int, r: Rivalry, taken: NDArray[np.bool_], match: Index) -> None:
+def _match_at(
+    threshold: float, first: int, last: int, r: MatchCandidates, taken: NDArray[np.bool_], match: Index
+) -> None:
     """Pass B for labels first to last - 1 with detections of at least `threshold`; fills `taken` and `match`."""
     for g in range(first, last):
         match[g] = -1
@@ -157,7 +161,7 @@ def _match_at(threshold: float, first: int, last: int, r: Rivalry, taken: NDArra
 
 
 @kernel
-def _mark_contested(first: int, last: int, r: Rivalry, contested: NDArray[np.bool_]) -> None:
+def _mark_contested(first: int, last: int, r: MatchCandidates, contested: NDArray[np.bool_]) -> None:
     """Mark the detections that some label of first to last - 1 could take."""
     for g in range(first, last):
         if r.label_flag[g] == INVISIBLE:
@@ -170,7 +174,7 @@ def _mark_contested(first: int, last: int, r: Rivalry, contested: NDArray[np.boo
 
 @kernel
 def _true_positives(
-    first: int, last: int, r: Rivalry, match: Index, label_alpha: Array, detection_alpha: Array
+    first: int, last: int, r: MatchCandidates, match: Index, label_alpha: Array, detection_alpha: Array
 ) -> tuple[int, float]:
     """Their number and orientation similarity after pass B."""
     tp, similarity = 0, 0.0
@@ -183,14 +187,14 @@ def _true_positives(
 
 
 @kernel
-def _is_stray(d: int, r: Rivalry) -> bool:
+def _is_stray(d: int, r: MatchCandidates) -> bool:
     """Whether an unmatched detection is a false positive: it counts and no DontCare area absorbs it."""
     return r.detection_flag[d] == VALID and r.dontcare[d] <= r.min_overlap
 
 
 @kernel
 def _pass_b_events(
-    label_offsets: Index, detection_offsets: Index, r: Rivalry, label_alpha: Array, detection_alpha: Array
+    label_offsets: Index, detection_offsets: Index, r: MatchCandidates, label_alpha: Array, detection_alpha: Array
 ) -> tuple[Array, Index, Index, Index, Array]:
     """Score, frame and changes of tp, fp and similarity wherever the outcome of pass B changes."""
     n = len(r.score)
@@ -209,15 +213,15 @@ def _pass_b_events(
                 score[count], frame[count], similarity[count] = r.score[d], f, 0.0
                 tp[count], fp[count] = 0, 1
                 count += 1
-        rivals = begin + np.nonzero(contested[begin:end])[0]
-        levels = np.unique(r.score[rivals])
+        candidates = begin + np.nonzero(contested[begin:end])[0]
+        levels = np.unique(r.score[candidates])
         tp_before, fp_before, similarity_before = 0, 0, 0.0
         for k in range(len(levels) - 1, -1, -1):
             taken[begin:end] = False
             _match_at(levels[k], first, last, r, taken, match)
             tp_now, similarity_now = _true_positives(first, last, r, match, label_alpha, detection_alpha)
             fp_now = 0
-            for d in rivals:
+            for d in candidates:
                 if r.score[d] >= levels[k] and not taken[d] and _is_stray(d, r):
                     fp_now += 1
             score[count], frame[count], similarity[count] = levels[k], f, similarity_now - similarity_before

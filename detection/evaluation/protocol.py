@@ -14,10 +14,10 @@ from detection.evaluation.matching import (
     INVISIBLE,
     VALID,
     Flags,
+    MatchCandidates,
     MatchRecords,
-    Rivalry,
+    match_candidates,
     record_matches,
-    rivalry,
 )
 from detection.evaluation.objects import Mask, ObjectTable, X, Y, Z
 from detection.evaluation.overlaps import Overlaps, overlaps_of
@@ -207,12 +207,12 @@ class Matcher:
         """Both matching passes over all frames."""
         labels, detections = self.pair.labels, self.pair.detections
         alphas = (labels.alpha, detections.alpha)
-        return record_matches(labels.offsets, detections.offsets, self.rivalry(target, level), alphas)
+        return record_matches(labels.offsets, detections.offsets, self.match_candidates(target, level), alphas)
 
-    def rivalry(self, target: Target, level: int) -> Rivalry:
+    def match_candidates(self, target: Target, level: int) -> MatchCandidates:
         """Overlaps, flags and scores of one target and level, as the matching takes them."""
         flags = self.flags(target, level)
-        return rivalry(self.overlaps(target.overlap), target.iou, flags, self.pair.detections.score)
+        return match_candidates(self.overlaps(target.overlap), target.iou, flags, self.pair.detections.score)
 
     def is_evaluated(self, target: Target) -> bool:
         """Whether the reference gives a value: the class is detected at least once, and for AOS with orientation."""

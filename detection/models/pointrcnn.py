@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from detection.augment import augment_regions
+from detection.data_augmentation import augment_regions
 from detection.losses import bin_box_loss, consistency_loss, foreground_loss, masked_bce
 from detection.models.batch import PointBatch, RawDetections
 from detection.models.box_coding import MEAN_SIZES, boxes_from_points, boxes_from_rois, rotate_y, to_roi_frame

@@ -22,7 +22,7 @@ from pipeline.geometry.rings import split_rings
 
 Array = NDArray[np.float64]
 
-ROW_STEPS = {32: 2, 16: 4, 8: 8}
+BEAM_STRIDES = {32: 2, 16: 4, 8: 8}
 # "Clean" windows: nothing measured between the two surfaces within 8 columns and so many rows (half an input gap + 3).
 CLEAN_ROWS = {2: 10, 4: 16, 8: 28}
 CLEAN_COLUMNS = 8
@@ -54,7 +54,7 @@ def hold_out(
     points: NDArray[np.floating], calibration: Calibration, image_size: tuple[int, int], rows: int
 ) -> HeldOutFrame:
     """Splits a 64-ring scan into input rings and held-out truth. rows: 32, 16 or 8."""
-    step = ROW_STEPS[rows]
+    step = BEAM_STRIDES[rows]
     ring = split_rings(points)
     given = ring % step == 0
     seen = visible_points(points, ring, calibration, image_size)

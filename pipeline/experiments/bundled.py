@@ -1,4 +1,4 @@
-"""The embedded completion network beside a classical completion and beside itself trained by a squared loss."""
+"""The bundled completion network beside a classical completion and beside itself trained by a squared loss."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LARGE, LARGE_L2 = "larger width, likelihood", "larger width, L2"
 
 
 def trained(loss: str, width: int, start: str = "") -> Recipe:
-    """A training of the embedded network, from random weights or grown from `start`."""
+    """A training of the bundled network, from random weights or grown from `start`."""
     return Recipe("selection", {"loss": loss, "width": width, "start": start})
 
 
@@ -32,7 +32,7 @@ RECIPES = {
     LARGE: trained("mixture", 32, SHIPPED_SMALL),
     LARGE_L2: trained("l2", 32, SHIPPED_SMALL),
 }
-JUDGED = {"mae_mm": "MAE", "tmae_mm": "tMAE", "mixed_percent": "mixed depth"}
+PRIMARY_METRICS = {"mae_mm": "MAE", "tmae_mm": "tMAE", "mixed_percent": "mixed depth"}
 # (what is claimed, better, worse)
 ORDERS = (
     ("the larger network beats the classical completion", LARGE, CLASSICAL),
@@ -46,9 +46,9 @@ def _label(rows: int, name: str) -> str:
 
 
 TABLE = Table(
-    "embedded",
+    "bundled",
     "table",
-    "The embedded completion network, a classical completion, and L2",
+    "The bundled completion network, a classical completion, and L2",
     "is it the loss that makes edges sharp?",
     COLUMNS,
     tuple(Row(_label(rows, name), recipe=recipe, view=str(rows)) for rows in ROWS for name, recipe in RECIPES.items()),
@@ -56,11 +56,11 @@ TABLE = Table(
         Claim(f"{rows} rows: {text} in {title}", column, (_label(rows, better),), (_label(rows, worse),))
         for rows in ROWS
         for text, better, worse in ORDERS
-        for column, title in JUDGED.items()
+        for column, title in PRIMARY_METRICS.items()
     ),
     notes=(
         "not in the thesis: its claim about twin surfaces, on the network that ships",
-        "likelihood: the loss of the embedded network, whose quantiles are the twin surfaces; L2: the same network, "
+        "likelihood: the loss of the bundled network, whose quantiles are the twin surfaces; L2: the same network, "
         "trained on and read by its expected depth",
         "the larger width is grown from `selection_small`, trained by likelihood, and goes on by either loss",
         "truth is the exact depth where a full scan measures, to 80 m",

@@ -1,4 +1,4 @@
-"""Runs of kinds "completer" (score one that is there) and "selection" (train the embedded network, then score it).
+"""Runs of kinds "completer" (score one that is there) and "selection" (train the bundled network, then score it).
 
 Settings: `completer`, a name for `completion.infer.load_completer`; or `loss` ("mixture" or "l2"), `width` and `start`
 (weights to grow from, "" for none). Scores are those of the completion tables, at 64 and 16 rows: "64/mae_mm", ...
@@ -28,13 +28,13 @@ KEPT = ("mae_mm", "rmse_mm", "tmae_mm", "mixed_percent", "edge_tmae_mm")
 
 
 @dataclass(frozen=True)
-class EmbeddedBudget:
+class BundledBudget:
     """Data and training.
 
     train_frames, test_frames   frames of the synthetic world; size (height, width) of images, None for KITTI's own
     crop, batch     training crops of a step
     steps           of a network from random weights; grown_steps: of one that begins with trained weights
-    row_steps       every n-th LiDAR ring, n drawn for each crop
+    beam_strides       every n-th LiDAR ring, n drawn for each crop
     seconds_per_step, seconds_per_test_frame   on one core of a 2-core AMD EPYC server (AVX2)
     """
 
@@ -45,7 +45,7 @@ class EmbeddedBudget:
     batch: int
     steps: int
     grown_steps: int
-    row_steps: tuple[int, ...] = (1, 2, 4, 4, 8)
+    beam_strides: tuple[int, ...] = (1, 2, 4, 4, 8)
     calibration_jitter: float = 0.03
     learning_rate: float = 1e-3
     seconds_per_step: float = 0.0
@@ -53,20 +53,20 @@ class EmbeddedBudget:
     seconds_per_data_frame: float = 2.1
 
 
-BUDGETS: Mapping[str, EmbeddedBudget] = {
-    "smoke": EmbeddedBudget(2, 2, (96, 320), (64, 96), 2, 2, 2, seconds_per_step=0.1, seconds_per_test_frame=0.3),
-    "small": EmbeddedBudget(160, 200, None, (128, 416), 4, 800, 300, seconds_per_step=0.6, seconds_per_test_frame=0.9),
+BUDGETS: Mapping[str, BundledBudget] = {
+    "smoke": BundledBudget(2, 2, (96, 320), (64, 96), 2, 2, 2, seconds_per_step=0.1, seconds_per_test_frame=0.3),
+    "small": BundledBudget(160, 200, None, (128, 416), 4, 800, 300, seconds_per_step=0.6, seconds_per_test_frame=0.9),
     # The schedule of configs/weights/completion-small.yaml and completion-large.yaml.
-    "paper": EmbeddedBudget(800, 200, None, (192, 512), 4, 4000, 700, seconds_per_step=1.0, seconds_per_test_frame=0.9),
+    "paper": BundledBudget(800, 200, None, (192, 512), 4, 4000, 700, seconds_per_step=1.0, seconds_per_test_frame=0.9),
 }
 
 
-def data_identity(data: Path | None, budget: EmbeddedBudget) -> Any:
+def data_identity(data: Path | None, budget: BundledBudget) -> Any:
     """See `worlds.world_identity`."""
     return world_identity(data, budget.train_frames, budget.test_frames, budget.size)
 
 
-def cost(recipe: Recipe, budget: EmbeddedBudget) -> Cost:
+def cost(recipe: Recipe, budget: BundledBudget) -> Cost:
     """Steps and test frames by their measured seconds; frames once."""
     frames = budget.train_frames + budget.test_frames
     seconds = budget.test_frames * budget.seconds_per_test_frame
@@ -75,7 +75,7 @@ def cost(recipe: Recipe, budget: EmbeddedBudget) -> Cost:
     return Cost(seconds, 10e6, frames * budget.seconds_per_data_frame, frames * 5e6)
 
 
-def _steps(recipe: Recipe, budget: EmbeddedBudget) -> int:
+def _steps(recipe: Recipe, budget: BundledBudget) -> int:
     return budget.grown_steps if recipe.settings["start"] else budget.steps
 
 
@@ -83,7 +83,7 @@ def run(recipe: Recipe, context: Context) -> Outcome:
     """Scores a completer, trained first where the recipe says so; a killed training continues."""
     from completion.infer import load_completer
 
-    budget: EmbeddedBudget = context.budget
+    budget: BundledBudget = context.budget
     world = open_world(
         context.out / "data", context.data, budget.train_frames, budget.test_frames, budget.size, context.say
     )
@@ -93,18 +93,18 @@ def run(recipe: Recipe, context: Context) -> Outcome:
     return score(load_completer(name, backend="auto"), world.test)
 
 
-def train_settings(recipe: Recipe, budget: EmbeddedBudget, seed: int) -> TrainSettings:
+def train_settings(recipe: Recipe, budget: BundledBudget, seed: int) -> TrainSettings:
     """Those of configs/weights/completion-*.yaml but for the loss, the crops and the number of steps."""
     from completion.models import default_spec
     from completion.samples import Augmentation
     from completion.train import TrainSettings
-    from completion.training_loss import Objective
+    from completion.training_loss import LossSettings
 
     start = str(recipe.settings["start"])
     steps = _steps(recipe, budget)
     return TrainSettings(
         default_spec("selection", width=int(recipe.settings["width"])),
-        Objective(str(recipe.settings["loss"]), deepest=90, above_top_ring=0.3, edge_weight=1.0),
+        LossSettings(str(recipe.settings["loss"]), max_depth=90, above_top_ring=0.3, edge_weight=1.0),
         Augmentation(crop=budget.crop, flip=0.5, jitter=0.3, gamma=0.4, noise=6.0, drop=0.15, edge_crops=0.3),
         seed=seed,
         epochs=1,
@@ -119,7 +119,7 @@ def train_settings(recipe: Recipe, budget: EmbeddedBudget, seed: int) -> TrainSe
         scale_weights=((0, (1,)),),
         warm_start=start or None,
         # A squared loss teaches the mean of the mixture, so that is what it is read by.
-        read_out="expected" if recipe.settings["loss"] == "l2" else "median",
+        decoding="expected" if recipe.settings["loss"] == "l2" else "median",
         log_every=max(1, steps // 20),
         checkpoint_steps=max(1, steps // 8),
     )
@@ -129,9 +129,9 @@ def _trained(recipe: Recipe, frames: Dataset, context: Context) -> Path:
     from completion.train import train
     from pipeline.training.stage import DepthSamples
 
-    budget: EmbeddedBudget = context.budget
-    samples = DepthSamples(frames, budget.row_steps, budget.calibration_jitter)
-    train(train_settings(recipe, budget, context.seed), samples, context.folder, facts={"experiment": "embedded"})
+    budget: BundledBudget = context.budget
+    samples = DepthSamples(frames, budget.beam_strides, budget.calibration_jitter)
+    train(train_settings(recipe, budget, context.seed), samples, context.folder, facts={"experiment": "bundled"})
     return context.folder / "last.safetensors"
 
 

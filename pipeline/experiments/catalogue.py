@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pipeline.base.errors import UsageError
 from pipeline.base.settings import nearest_name
-from pipeline.experiments import bundled as embedded
-from pipeline.experiments import chapter_2_3, chapter_4, chapter_5, chapter_5_exact, chapter_5_figures
+from pipeline.experiments import bundled, chapter_2_3, chapter_4, chapter_5, chapter_5_exact, chapter_5_figures
 from pipeline.experiments.tables import Table
 
 TABLES: tuple[Table, ...] = (
@@ -14,12 +13,15 @@ TABLES: tuple[Table, ...] = (
     *chapter_5.TABLES,
     *chapter_5_exact.TABLES,
     *chapter_5_figures.TABLES,
-    embedded.TABLE,
+    bundled.TABLE,
 )
+# Names of earlier versions, still taken.
+FORMER_NAMES = {"embedded": "bundled"}
 
 
 def find(kind: str, number: str) -> Table:
     """The table or figure of this number. UsageError that names the nearest one."""
+    number = FORMER_NAMES.get(number, number)
     for table in TABLES:
         if (table.kind, table.number) == (kind, number):
             return table

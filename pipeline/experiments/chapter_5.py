@@ -15,7 +15,7 @@ AP_COLUMNS = (
     Column("bev_0.5_moderate", "BEV moderate, IoU 0.5", "%", HIGHER),
 )
 # The column in which claims are judged.
-JUDGED = "bev_0.5_moderate"
+PRIMARY_METRIC = "bev_0.5_moderate"
 
 # The reasons that table "lost" shows; `detection.evaluation.explain` knows some more.
 REASONS = (
@@ -34,7 +34,7 @@ NOTES = (
     "intervals: over seeds (t) where there are several, else a bootstrap over the test frames, which does not hold "
     "the scatter between trainings",
 )
-TWISE_NOTE = "TWISE's place is taken by the embedded twin-surface network `selection_small`, masks are the true ones"
+TWISE_NOTE = "TWISE's place is taken by the bundled twin-surface network `selection_small`, masks are the true ones"
 QUOTED_POINTRCNN = (
     "quoted: at CPU sizes PointRCNN and PointRCNN2 are one network; `detection` has both, for budget paper"
 )
@@ -67,7 +67,7 @@ def ap_table(
 
 def claim(text: str, better: tuple[str, ...], worse: tuple[str, ...]) -> Claim:
     """An ordering in the column that is judged."""
-    return Claim(text, JUDGED, better, worse)
+    return Claim(text, PRIMARY_METRIC, better, worse)
 
 
 L, D = lidar_recipe("L"), lidar_recipe("D")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.experiments.chapter_5 import JUDGED
+from pipeline.experiments.chapter_5 import PRIMARY_METRIC
 from pipeline.experiments.chapter_5_exact import CLEAN, NOISY, noise_label, noise_steps
 from pipeline.experiments.chapter_5_figures import FPS_INPUTS, SHARES, THRESHOLDS, fps_label, sigma_view
 from pipeline.experiments.example import read_example
@@ -110,7 +110,7 @@ def draw_bev(result: TableResult, figure: Any) -> None:
 def draw_noise(result: TableResult, figure: Any) -> None:
     """AP over the strength of each kind of noise, for detectors trained on clean and on equally noisy clouds."""
     axes = figure.subplots(1, 2, sharey=True)
-    column = result.table.column(JUDGED)
+    column = result.table.column(PRIMARY_METRIC)
 
     def value(label: str) -> Estimate | None:
         return estimate(result.outcomes.get(label, []), result.table.row(label), column)

@@ -239,7 +239,7 @@ NOISE_ROWS = replace(
         "real noise: what does completion from fewer rows cost?",
         _completed_rows(),
     ),
-    notes=(*NOTES, "depth completed by the embedded network from 64 to 8 rows; its error is the noise"),
+    notes=(*NOTES, "depth completed by the bundled network from 64 to 8 rows; its error is the noise"),
 )
 
 _LOST_COLUMNS = (

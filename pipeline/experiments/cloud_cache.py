@@ -18,7 +18,7 @@ from pipeline.base.errors import DataError, UsageError
 from pipeline.base.paths import RunFolder, safe_id
 from pipeline.data import Dataset, Frame
 from pipeline.experiments.inputs import InputCloud, InputRecipe, lidar_points, make_input
-from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.run_folder.frame_outputs import FrameOutputs
 
 if TYPE_CHECKING:
     from completion.infer import Completer
@@ -45,7 +45,7 @@ class DepthCache:
     """Depth of frames, `root`/depth-NAME/ in the layout of a run.
 
     root     one folder per data set, because ids may repeat between them
-    network  of depth "completed": an embedded name or a path of weights
+    network  of depth "completed": a bundled name or a path of weights
     """
 
     root: Path
@@ -63,7 +63,7 @@ class DepthCache:
             if not frame.has("target_depth"):
                 raise UsageError(f"{frame.where} frame {frame.id}: no dense true depth (Virtual KITTI 2 has it)")
             return CompletedDepth(frame.target_depth)
-        files = FrameFiles(RunFolder(self.root / self.name(depth, rows)), frame.id)
+        files = FrameOutputs(RunFolder(self.root / self.name(depth, rows)), frame.id)
         if not files.run.depth(frame.id).is_file():
             files.write_completed(self._made(frame, depth, rows))
         return files.read_completed()

@@ -35,7 +35,7 @@ _KINDS: tuple[Mapping[str, Any], ...] = (
 
 
 def start_inputs(frame: Frame) -> list[InputRecipe]:
-    """Kinds of clouds the common start is trained on, as far as a data set with such frames offers them."""
+    """Kinds of clouds the common pretraining is trained on, as far as a data set with such frames offers them."""
     recipes = (with_changes(InputRecipe(), kind, "start") for kind in _KINDS)
     return [recipe for recipe in recipes if recipe.is_possible(frame)]
 

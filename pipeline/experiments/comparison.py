@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.experiments import frames as stored
 from pipeline.experiments.chapter_2_3 import training
-from pipeline.experiments.completion_inputs import default_read_out, load_weights, model_spec, test_frame
+from pipeline.experiments.completion_inputs import default_decoding, load_weights, model_spec, test_frame
 from pipeline.experiments.runs import Context, Outcome, do_run, plan_run
 from pipeline.experiments.tables import Recipe
 
@@ -27,7 +27,7 @@ def predictions(recipe: Recipe, context: Context, paths: Sequence[Path]) -> list
     do_run(run, context.out, context.data, context.say)
     spec = model_spec(recipe, context.budget)
     model = load_weights(spec, run.folder(context.out) / "last.safetensors")
-    completer = NetworkCompleter(model, spec, read_out=default_read_out(spec))
+    completer = NetworkCompleter(model, spec, decoding=default_decoding(spec))
     frames = [test_frame(recipe, path) for path in paths]
     return [completer.complete(frame.sparse[64], frame.image).depth for frame in frames]
 

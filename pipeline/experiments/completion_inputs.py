@@ -56,7 +56,7 @@ def model_spec(recipe: Recipe, budget: CompletionBudget) -> ModelSpec:
     return with_rgb(spec, budget.rgb) if budget.rgb != "unit" else spec
 
 
-def default_read_out(spec: ModelSpec) -> str:
+def default_decoding(spec: ModelSpec) -> str:
     """How the rows without a view are read: coefficients by three of them, everything else as usual."""
     return {"twin": "fused", "coefficients": "peak", "depth": "depth"}[spec.output]
 

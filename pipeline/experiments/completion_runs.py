@@ -16,7 +16,7 @@ from pipeline.experiments import frames as stored
 from pipeline.experiments.budgets import COMPLETION, CompletionBudget
 from pipeline.experiments.completion_inputs import (
     NETWORKS,
-    default_read_out,
+    default_decoding,
     image_of,
     load_remembered,
     load_weights,
@@ -86,7 +86,7 @@ def run(recipe: Recipe, context: Context) -> Outcome:
     weights = _train(settings, _Samples(recipe, train_paths), context)
     model = load_weights(settings.model, weights)
     tests = [test_frame(recipe, path) for path in test_paths]
-    completer = NetworkCompleter(model, settings.model, read_out=default_read_out(settings.model))
+    completer = NetworkCompleter(model, settings.model, decoding=default_decoding(settings.model))
     save_examples(context.folder, completer, tests)
     return score(completer, tests, settings.model, DIAGNOSED)
 
@@ -104,12 +104,12 @@ def train_settings(recipe: Recipe, budget: CompletionBudget, seed: int) -> Train
     """Settings of `completion.train`; one "epoch" is the whole run, so that the thesis' schedules scale."""
     from completion.samples import Augmentation
     from completion.train import TrainSettings
-    from completion.training_loss import Objective
+    from completion.training_loss import LossSettings
 
-    objective = Objective(str(recipe.settings["loss"]), gamma=float(recipe.settings.get("gamma", 2.0)))
+    loss_settings = LossSettings(str(recipe.settings["loss"]), gamma=float(recipe.settings.get("gamma", 2.0)))
     return TrainSettings(
         model_spec(recipe, budget),
-        objective,
+        loss_settings,
         Augmentation(crop=budget.crop, flip=0.5, jitter=0.1),
         seed=seed,
         epochs=1,

@@ -19,7 +19,7 @@ class DetectorChoice:
     preset, options   `detection.models.presets.PRESETS[preset](**options)`; the point features are added
     features          point columns beside x y z before those that an input adds (source, semantic)
     dense             name of an option that is True for completed depth and False for raw LiDAR; "" for none
-    start_steps       updates of the network that every row begins with (`common_start.py`); 0: random weights, as
+    start_steps       updates of the network that every row begins with (`common_pretraining.py`); 0: random weights, as
                       published. Detectors have about the same time for it, not the same steps
     seconds_per_step  of two clouds; seconds_per_frame of detection; measured on MACHINE, except those of budget
                       paper, which are extrapolated from one forward pass (docs/detection.md)
@@ -45,7 +45,7 @@ class DetectionBudget:
     augmented      scene augmentation (flip, turn, scale); the thesis uses none (5.4.4)
     cloud_points   most points of a stored cloud; the thesis draws 50k of dense depth
     detectors      networks by the thesis' names
-    completer      network of the completed depth: an embedded name or a path of weights
+    completer      network of the completed depth: a bundled name or a path of weights
     masks          where object masks come from, as `augment.semantics`
     resamples      of the bootstrap over test frames
     """

@@ -27,7 +27,7 @@ from pipeline.experiments.runs import Context, Cost, Outcome
 from pipeline.experiments.tables import Recipe
 from pipeline.experiments.worlds import World, open_world, world_identity
 from pipeline.pointcloud.taxonomy import LABELS
-from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.run_folder.frame_outputs import FrameOutputs
 
 if TYPE_CHECKING:
     from detection.kitti_format import KittiObject
@@ -121,7 +121,7 @@ def run(recipe: Recipe, context: Context) -> Outcome:
 
 def train_settings(recipe: DetectionRecipe, context: Context) -> TrainSettings:
     """What `detection.train` is told: the same steps for every row of a table."""
-    from detection.augment import SceneAugmentation
+    from detection.data_augmentation import SceneAugmentation
     from detection.optimiser import OneCycleSettings
     from detection.train import TrainSettings
 
@@ -149,16 +149,16 @@ def train_detector(recipe: DetectionRecipe, frames: Dataset, context: Context) -
     """Weights for a recipe; runs that differ only in their test clouds share them."""
     clouds = clouds_of(frames, recipe.train_input, context)
     begun = detector_choice(recipe, context.budget).start_steps > 0
-    start = common_start(recipe.detector, frames, context) if begun else None
+    start = common_pretraining(recipe.detector, frames, context) if begun else None
     return _trained(train_settings(recipe, context), clouds, [clouds.folder.name], start, context)
 
 
-def common_start(detector: str, frames: Dataset, context: Context) -> Path:
+def common_pretraining(detector: str, frames: Dataset, context: Context) -> Path:
     """Weights that every row with this detector begins with, whatever its seed and input; trained once."""
     sources = [clouds_of(frames, kind, context) for kind in start_inputs(frames[0])]
     recipe = DetectionRecipe(detector, InputRecipe(), InputRecipe())
     choice = detector_choice(recipe, context.budget)
-    first = common_start(choice.first_stage, frames, context) if choice.first_stage else None
+    first = common_pretraining(choice.first_stage, frames, context) if choice.first_stage else None
     settings = replace(train_settings(recipe, context), steps=choice.start_steps, seed=0)
     return _trained(settings, Mixture(sources), [source.folder.name for source in sources], first, context)
 
@@ -193,7 +193,7 @@ def detect(
     run_folder = RunFolder(context.folder)
     labels, found = {}, {}
     for frame in clouds.dataset:
-        files = FrameFiles(run_folder, frame.id)
+        files = FrameOutputs(run_folder, frame.id)
         if not run_folder.detections(frame.id).is_file():
             cloud = clouds.point_frame(frame)
             files.write_detections(result_objects(detector.detect(cloud), cloud))

@@ -40,15 +40,15 @@ def frame_scores(depth: Depth, target: Depth) -> dict[str, float]:
     }
 
 
-def read_outs(completer: NetworkCompleter, spec: ModelSpec, frame: DepthFrame) -> dict[str, Depth]:
+def decodings(completer: NetworkCompleter, spec: ModelSpec, frame: DepthFrame) -> dict[str, Depth]:
     """Depth by read-out name; the first is the network's default."""
-    from completion.decoding import READ_OUTS_OF
+    from completion.decoding import DECODINGS_OF
     from completion.twin_surface import fuse
 
     completed = completer.complete(frame.sparse, frame.image)
-    first = completer.read_out
+    first = completer.decoding
     found = {first: completed.depth}
-    for name in READ_OUTS_OF[spec.output]:
+    for name in DECODINGS_OF[spec.output]:
         if name in found:
             continue
         if completed.foreground is not None and completed.background is not None and completed.sigma is not None:
@@ -58,17 +58,17 @@ def read_outs(completer: NetworkCompleter, spec: ModelSpec, frame: DepthFrame) -
     return found
 
 
-def _other(completer: NetworkCompleter, read_out: str) -> Callable[[DepthFrame], CompletedDepth]:
+def _other(completer: NetworkCompleter, decoding: str) -> Callable[[DepthFrame], CompletedDepth]:
     from completion.infer import NetworkCompleter
 
-    other = NetworkCompleter(completer.model, completer.spec, read_out=read_out)
+    other = NetworkCompleter(completer.model, completer.spec, decoding=decoding)
     return lambda frame: other.complete(frame.sparse, frame.image)
 
 
 def score(completer: NetworkCompleter, frames: Sequence[StoredFrame], spec: ModelSpec, diagnosed: int) -> Outcome:
     """Means over test frames.
 
-    Names: "mae_mm" and so on for the default read-out against clean truth; "READ_OUT/mae_mm"; "semi_dense/mae_mm"
+    Names: "mae_mm" and so on for the default read-out against clean truth; "DECODING/mae_mm"; "semi_dense/mae_mm"
     against pseudo ground truth; "whole/", "edge/", "inside/" by region (Table 4.2); and, over the first `diagnosed`
     frames, what `completion.diagnostics.diagnose` finds: "alive/grey_mae_mm", "alive/sigma_spread", ...
     """
@@ -86,7 +86,7 @@ def score(completer: NetworkCompleter, frames: Sequence[StoredFrame], spec: Mode
             values.append(value)
 
     for number, frame in enumerate(frames):
-        found = read_outs(completer, spec, DepthFrame(frame.image, frame.sparse[64]))
+        found = decodings(completer, spec, DepthFrame(frame.image, frame.sparse[64]))
         for index, (name, depth) in enumerate(found.items()):
             scores = frame_scores(depth, frame.clean)
             add(name, scores, number)

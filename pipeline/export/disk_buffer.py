@@ -13,11 +13,11 @@ from typing import BinaryIO
 from pipeline.base.atomic import TEMPORARY_PREFIX
 
 
-class Spool:
+class DiskBuffer:
     """Byte strings on disk, in the order they were added. Closed (and removed) with the object's `close`."""
 
     def __init__(self) -> None:
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the spool
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the buffer
         self.count = 0
 
     def add(self, data: bytes) -> None:

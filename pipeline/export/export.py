@@ -14,7 +14,7 @@ from pipeline.base.errors import DataError, UsageError
 from pipeline.base.paths import RunFolder
 from pipeline.data.dataset import Dataset
 from pipeline.data.frame import Frame
-from pipeline.export.disk_buffer import Spool
+from pipeline.export.disk_buffer import DiskBuffer
 from pipeline.export.formats import FORMATS
 from pipeline.export.record import VIRTUAL, Options, Record
 from pipeline.export.source import ExportFrame, consumer_names, read_splits
@@ -62,7 +62,7 @@ def export(
     task = partial(_one_frame, dataset.open, run, out, format_name, options)
     summary = Summary()
     with ExitStack() as stack:
-        spools: dict[str, Spool] = {}
+        buffers: dict[str, DiskBuffer] = {}
         done: list[str] = []
         for frame_id, outcome in map_ordered(task, items, workers):
             if isinstance(outcome, str):
@@ -70,12 +70,12 @@ def export(
             else:
                 summary.add(outcome)
                 done.append(names[frame_id])
-                _keep(outcome.entries, spools, stack)
+                _keep(outcome.entries, buffers, stack)
             if progress is not None:
                 progress(frame_id)
         members = {split: frozenset(names[frame_id] for frame_id in ids) for split, ids in splits.items()}
         if format_.finish is not None:
-            summary.indexes += format_.finish(out, spools, done, members)
+            summary.indexes += format_.finish(out, buffers, done, members)
     _write_lists(out, dataset.ids, names, splits if format_.splits else {}, summary)
     return summary
 
@@ -116,13 +116,13 @@ def _one_frame(
         return frame_id, str(error)
 
 
-def _keep(entries: Iterable[tuple[str, bytes]], spools: dict[str, Spool], stack: ExitStack) -> None:
+def _keep(entries: Iterable[tuple[str, bytes]], buffers: dict[str, DiskBuffer], stack: ExitStack) -> None:
     """Puts a frame's index entries on disk until the end."""
     for name, data in entries:
-        if name not in spools:
-            spools[name] = Spool()
-            stack.callback(spools[name].close)
-        spools[name].add(data)
+        if name not in buffers:
+            buffers[name] = DiskBuffer()
+            stack.callback(buffers[name].close)
+        buffers[name].add(data)
 
 
 def _write_lists(

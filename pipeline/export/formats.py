@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline.export import clouds, kitti_tree, mmdet3d, openpcdet, parquet, sfd, virconv
-from pipeline.export.disk_buffer import Spool
+from pipeline.export.disk_buffer import DiskBuffer
 from pipeline.export.record import Options, Record
 from pipeline.export.source import ExportFrame
 
 WriteFrame = Callable[[ExportFrame, Path, Options], Record]
-Finish = Callable[[Path, Mapping[str, Spool], list[str], Mapping[str, frozenset[str]]], list[Path]]
+Finish = Callable[[Path, Mapping[str, DiskBuffer], list[str], Mapping[str, frozenset[str]]], list[Path]]
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 
 from detection.kitti_format import KittiObject, boxes_of
 from pipeline.data.kitti_object import write_velodyne
-from pipeline.export.disk_buffer import Spool, write_streamed
+from pipeline.export.disk_buffer import DiskBuffer, write_streamed
 from pipeline.export.geometry import boxes_in_lidar, in_image, points_in_box
 from pipeline.export.kitti_tree import care_first, square, write_kitti_frame
 from pipeline.export.pickles import item_opcodes, write_dict_of_lists
@@ -125,7 +125,7 @@ def difficulty(item: KittiObject) -> int:
 
 
 def finish(
-    out: Path, spools: Mapping[str, Spool], names: list[str], splits: Mapping[str, frozenset[str]]
+    out: Path, buffers: Mapping[str, DiskBuffer], names: list[str], splits: Mapping[str, frozenset[str]]
 ) -> list[Path]:
     """kitti_infos_SPLIT.pkl of every split."""
     metainfo = {"categories": CATEGORIES, "dataset": "kitti", "info_version": "1.1"}
@@ -133,7 +133,7 @@ def finish(
     for split, members in splits.items():
         path = out / f"kitti_infos_{split}.pkl"
         entries = [(name in members) for name in names]
-        infos = (entry for keep, entry in zip(entries, spools[INFOS]) if keep) if names else iter(())
+        infos = (entry for keep, entry in zip(entries, buffers[INFOS]) if keep) if names else iter(())
         lists = [("data_list", infos)]
         write_streamed(path, lambda file, lists=lists: write_dict_of_lists(file, {"metainfo": metainfo}, lists))  # type: ignore[misc]
         written.append(path)

@@ -20,7 +20,7 @@ from detection.boxes import wrap_angle
 from detection.kitti_format import KittiObject, boxes_of
 from pipeline.base.atomic import write_bytes, write_text
 from pipeline.data.kitti_object import write_velodyne
-from pipeline.export.disk_buffer import Spool, write_streamed
+from pipeline.export.disk_buffer import DiskBuffer, write_streamed
 from pipeline.export.geometry import boxes_in_lidar, in_image, points_in_box
 from pipeline.export.kitti_tree import care_first, square, write_kitti_frame
 from pipeline.export.pickles import item_opcodes, write_dict_of_lists, write_list
@@ -118,18 +118,18 @@ def _database_entries(item: ExportFrame, info: dict[str, Any], out: Path) -> Ite
 
 
 def finish_kitti(
-    out: Path, spools: Mapping[str, Spool], names: list[str], splits: Mapping[str, frozenset[str]]
+    out: Path, buffers: Mapping[str, DiskBuffer], names: list[str], splits: Mapping[str, frozenset[str]]
 ) -> list[Path]:
     """kitti_infos_SPLIT.pkl of every split and kitti_dbinfos_train.pkl from the frames' entries."""
     written = []
     for split, members in splits.items():
         path = out / f"kitti_infos_{split}.pkl"
-        infos = (entry for name, entry in zip(names, spools[INFOS]) if name in members) if names else iter(())
+        infos = (entry for name, entry in zip(names, buffers[INFOS]) if name in members) if names else iter(())
         write_streamed(path, lambda file, infos=infos: write_list(file, infos))  # type: ignore[misc]
         written.append(path)
-    classes = [name for name in spools if name.startswith(DATABASE)]
+    classes = [name for name in buffers if name.startswith(DATABASE)]
     path = out / "kitti_dbinfos_train.pkl"
-    lists = [(name.removeprefix(DATABASE), spools[name]) for name in classes]
+    lists = [(name.removeprefix(DATABASE), buffers[name]) for name in classes]
     write_streamed(path, lambda file: write_dict_of_lists(file, {}, lists))
     return [*written, path]
 

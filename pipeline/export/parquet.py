@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from pipeline.base.errors import UsageError
-from pipeline.export.disk_buffer import Spool, write_streamed
+from pipeline.export.disk_buffer import DiskBuffer, write_streamed
 from pipeline.export.record import Options, Record
 from pipeline.export.source import ExportFrame
 
@@ -33,22 +33,22 @@ def write_frame(item: ExportFrame, out: Path, options: Options) -> Record:
 
 
 def finish(
-    out: Path, spools: Mapping[str, Spool], names: list[str], splits: Mapping[str, frozenset[str]]
+    out: Path, buffers: Mapping[str, DiskBuffer], names: list[str], splits: Mapping[str, frozenset[str]]
 ) -> list[Path]:
     """detections.parquet: frame, class (text) and the columns NUMBERS (float64). Raises UsageError without pyarrow."""
     path = out / FILE
-    spool = spools.get(ROWS)
-    write_streamed(path, lambda file: _write(file, spool if spool is not None else Spool()))
+    buffer = buffers.get(ROWS)
+    write_streamed(path, lambda file: _write(file, buffer if buffer is not None else DiskBuffer()))
     return [path]
 
 
-def _write(file: BinaryIO, spool: Spool) -> None:
+def _write(file: BinaryIO, buffer: DiskBuffer) -> None:
     pyarrow, parquet = _pyarrow()
     kinds = [("frame", pyarrow.string()), ("class", pyarrow.string()), *((n, pyarrow.float64()) for n in NUMBERS)]
     schema = pyarrow.schema(kinds)
     with parquet.ParquetWriter(file, schema) as writer:
         group: list[dict[str, object]] = []
-        for entry in spool:
+        for entry in buffer:
             group += [
                 {"frame": row["frame"], "class": row["class"], **dict(zip(NUMBERS, row["values"]))}
                 for row in json.loads(entry)

@@ -18,7 +18,7 @@ from pipeline.base.paths import RunFolder
 from pipeline.data.cloud_files import Cloud
 from pipeline.data.frame import Frame
 from pipeline.data.kitti_object import read_labels
-from pipeline.run_folder.frame_outputs import FrameFiles, read_npz, read_run_file
+from pipeline.run_folder.frame_outputs import FrameOutputs, read_npz, read_run_file
 
 BASE_COLUMNS = ("x", "y", "z", "intensity", "source")
 RAW_COLUMNS = BASE_COLUMNS[:4]
@@ -52,7 +52,7 @@ class ExportFrame:
     @cached_property
     def completed(self) -> CompletedDepth:
         """Completed depth of the run."""
-        completed = FrameFiles(self._run("completed depth"), self.frame.id).read_completed()
+        completed = FrameOutputs(self._run("completed depth"), self.frame.id).read_completed()
         if completed.size != self.frame.image_size:
             where = self._run("completed depth").depth(self.frame.id)
             raise DataError(where, f"depth of the image's size {self.frame.image_size}", f"{completed.size}")

@@ -1,4 +1,4 @@
-"""From a training run to embedded weights: held-out figures go onto the card, files into the package.
+"""From a training run to bundled weights: held-out figures go onto the card, files into the package.
 
     python -m pipeline.pretrained completion RUN NAME --data HELD_OUT --config CONFIG --limits TEXT
     python -m pipeline.pretrained detection RUN NAME --data HELD_OUT --cloud L --config CONFIG --limits TEXT
@@ -25,7 +25,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--config", required=True, nargs="+", help="what RUN was trained by, and runs it began with")
     parser.add_argument("--limits", required=True, help="what the network is not good at, for its card")
     args = parser.parse_args(argv)
-    source, target = cards.weights_of(args.room, args.run), cards.embedded_path(args.room, args.name)
+    source, target = cards.weights_of(args.room, args.run), cards.bundled_path(args.room, args.name)
     configs = [load_config(path) for path in args.config]
     card = cards.read_card(source)
     card |= {"name": args.name, "limits": args.limits, **cards.origin(card), **how_made(args.config, configs)}

@@ -1,4 +1,4 @@
-"""Puts the figures of another training beside those of embedded weights: how far a training of yours may be from them.
+"""Puts the figures of another training beside those of bundled weights: how far a training of yours may be from them.
 
     python -m pipeline.pretrained.again completion RUN NAME --data HELD_OUT
     python -m pipeline.pretrained.again detection RUN NAME --data HELD_OUT --cloud L
@@ -19,19 +19,19 @@ from pipeline.pretrained import cards
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line; see the module's text. Raises UsageError when there is no such name, or the run has no weights."""
     args = cards.parser_of("pipeline.pretrained.again", __doc__).parse_args(argv)
-    embedded, held_out = cards.embedded_path(args.room, args.name), cards.held_out_of(args)
-    if not embedded.is_file():
-        raise UsageError(f"{embedded}: no embedded weights of this name; embed a first training (pipeline.pretrained)")
+    bundled, held_out = cards.bundled_path(args.room, args.name), cards.held_out_of(args)
+    if not bundled.is_file():
+        raise UsageError(f"{bundled}: no bundled weights of this name; embed a first training (pipeline.pretrained)")
     source = cards.weights_of(args.room, args.run)
-    card, other = cards.read_card(embedded), cards.read_card(source)
+    card, other = cards.read_card(bundled), cards.read_card(source)
     known = card.get("held_out", {})
     if any(known.get(key) != value for key, value in held_out.which.items()):
-        card |= {**cards.measured(args.room, embedded, held_out), "trained_again": []}
+        card |= {**cards.measured(args.room, bundled, held_out), "trained_again": []}
     repeat = {**cards.origin(other), "sha256": other["sha256"], "held_out": held_out.figures(args.room, source)}
     others = [each for each in card.get("trained_again", []) if each["sha256"] != repeat["sha256"]]
     card["trained_again"] = [*others, repeat]
-    cards.write_card(embedded, card)
-    print(embedded.with_suffix(".json"))
+    cards.write_card(bundled, card)
+    print(bundled.with_suffix(".json"))
     return 0
 
 

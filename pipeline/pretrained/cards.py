@@ -1,4 +1,4 @@
-"""Cards of embedded weights: what goes on them, where they are, how they are written."""
+"""Cards of bundled weights: what goes on them, where they are, how they are written."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from pipeline.base.atomic import write_text
 from pipeline.base.errors import UsageError
 from pipeline.data import open_dataset
 from pipeline.pretrained.figures import AT_THRESHOLD, HeldOut
-from pipeline.run_folder.weights import embedded_folder
+from pipeline.run_folder.weights import bundled_folder
 
 ROOMS = {"completion": "completion", "detection": "detection", "segmentation": "pipeline/semantics"}
 
 
-def embedded_path(room: str, name: str) -> Path:
-    """Where the embedded weights of this name are."""
-    return embedded_folder(ROOMS[room]) / f"{name}.safetensors"
+def bundled_path(room: str, name: str) -> Path:
+    """Where the bundled weights of this name are."""
+    return bundled_folder(ROOMS[room]) / f"{name}.safetensors"
 
 
 def weights_of(room: str, run: Path) -> Path:
@@ -73,7 +73,7 @@ def parser_of(program: str, text: str | None) -> argparse.ArgumentParser:
     )
     parser.add_argument("room", choices=tuple(ROOMS))
     parser.add_argument("run", type=Path, help="folder of the training run")
-    parser.add_argument("name", help="name of the embedded weights")
+    parser.add_argument("name", help="name of the bundled weights")
     parser.add_argument("--data", required=True, help="held-out synthetic data set in KITTI object layout")
     parser.add_argument("--frames", default="0:", help="frames of it (default: all)")
     parser.add_argument("--cloud", default="L", help="detection: preset of the clouds it was trained on")

@@ -1,4 +1,4 @@
-"""Figures of networks on held-out synthetic frames, as they stand on the cards of the embedded weights."""
+"""Figures of networks on held-out synthetic frames, as they stand on the cards of the bundled weights."""
 
 from __future__ import annotations
 

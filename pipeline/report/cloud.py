@@ -13,7 +13,7 @@ from pipeline.base.errors import DataError
 from pipeline.data import Frame
 from pipeline.geometry.in_view import lidar_pixels
 from pipeline.report import pictures
-from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.run_folder.frame_outputs import FrameOutputs
 
 # All frames of a page share this many points, so that 20 frames stay under 15 MB; one frame takes no more than MOST.
 POINTS_OF_A_PAGE, MOST_POINTS = 300_000, 24_000
@@ -77,7 +77,7 @@ def point_budget(frames: int) -> int:
     return min(MOST_POINTS, POINTS_OF_A_PAGE // max(frames, 1))
 
 
-def frame_cloud(frame: Frame, files: FrameFiles) -> FrameCloud | None:
+def frame_cloud(frame: Frame, files: FrameOutputs) -> FrameCloud | None:
     """The augmented cloud, else the raw LiDAR, with every colouring the frame has data for; None without points."""
     if files.run.cloud(frame.id).is_file():
         cloud = files.read_cloud()
@@ -107,7 +107,7 @@ def _bytes_at(pixels: NDArray[np.int64], values: NDArray[np.uint8]) -> NDArray[n
     return np.where(pixels >= 0, values.reshape(-1)[pixels.clip(0)], NO_BYTE).astype(np.uint8)
 
 
-def _sigma_map(files: FrameFiles) -> NDArray[np.uint8] | None:
+def _sigma_map(files: FrameOutputs) -> NDArray[np.uint8] | None:
     """(H, W) sigma x 250, of frames with two surfaces."""
     if not files.run.twin(files.id).is_file():
         return None
@@ -119,7 +119,7 @@ def _class_map(frame: Frame) -> NDArray[np.uint8] | None:
     return frame.semantics if frame.has("semantics") else None
 
 
-def _noise_map(frame: Frame, files: FrameFiles) -> NDArray[np.uint8] | None:
+def _noise_map(frame: Frame, files: FrameOutputs) -> NDArray[np.uint8] | None:
     """(H, W) noise kinds, of frames with completed depth and true depth of every pixel (thesis 5.3.2)."""
     if not frame.has("target_depth") or not files.run.depth(frame.id).is_file():
         return None
@@ -247,7 +247,7 @@ def palettes() -> dict[str, Any]:
     }
 
 
-def cloud_of_frame(frame: Frame, files: FrameFiles) -> FrameCloud | None:
+def cloud_of_frame(frame: Frame, files: FrameOutputs) -> FrameCloud | None:
     """As `frame_cloud`, without the colourings whose files are damaged (the page names those elsewhere)."""
     try:
         return frame_cloud(frame, files)

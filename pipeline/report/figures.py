@@ -23,9 +23,9 @@ from pipeline.base.errors import DataError
 from pipeline.base.paths import RunFolder
 from pipeline.data import Dataset, Frame
 from pipeline.report import panels
-from pipeline.report.matches import Judged, strictest
+from pipeline.report.matches import MatchedFrames, strictest
 from pipeline.run_folder.config import Config
-from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.run_folder.frame_outputs import FrameOutputs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,7 +61,7 @@ class Material:
     @classmethod
     def of(cls, run: RunFolder, frame: Frame) -> Material:
         """Reads it. Raises DataError when the frame's files are damaged or absent."""
-        files = FrameFiles(run, frame.id)
+        files = FrameOutputs(run, frame.id)
         return cls(
             frame,
             files.read_completed(),
@@ -81,7 +81,12 @@ class Material:
 
 
 def write_figures(
-    config: Config, run: RunFolder, dataset: Dataset, frames: Sequence[str], judged: Judged, least: float = -math.inf
+    config: Config,
+    run: RunFolder,
+    dataset: Dataset,
+    frames: Sequence[str],
+    matched: MatchedFrames,
+    least: float = -math.inf,
 ) -> list[Path]:
     """Writes report/figures/*.png|pdf|svg (`report.format`) and returns their paths.
 
@@ -93,7 +98,7 @@ def write_figures(
     folder = run.report.parent / "figures"
     written = []
     with matplotlib.rc_context(STYLE):
-        for name, draw in _drawings(run, dataset, frames[: config.report.frames], judged, least):
+        for name, draw in _drawings(run, dataset, frames[: config.report.frames], matched, least):
             figure = draw()
             path = folder / f"{name}.{config.report.format}"
             write_bytes(path, saved(figure, config.report.format))
@@ -112,12 +117,12 @@ def saved(figure: Figure, kind: str) -> bytes:
 
 
 def _drawings(
-    run: RunFolder, dataset: Dataset, frames: Sequence[str], judged: Judged, least: float
+    run: RunFolder, dataset: Dataset, frames: Sequence[str], matched: MatchedFrames, least: float
 ) -> list[tuple[str, Callable[[], Figure]]]:
     """(file name, function that draws) of every figure this run has data for."""
     drawings: list[tuple[str, Callable[[], Figure]]] = []
-    if _found_targets(judged):
-        drawings.append(("precision_recall", lambda: precision_recall(judged)))
+    if _found_targets(matched):
+        drawings.append(("precision_recall", lambda: precision_recall(matched)))
     material = _richest(run, dataset, frames)
     if material is None:
         return drawings
@@ -228,9 +233,9 @@ def detections(material: Material, least: float) -> Figure:
     return panels.image_over_bev(frame, cloud, labels, found, WIDTH)
 
 
-def precision_recall(judged: Judged) -> Figure:
+def precision_recall(matched: MatchedFrames) -> Figure:
     """3D and bird's-eye precision over recall of every class of which something was found."""
-    targets = _found_targets(judged)
+    targets = _found_targets(matched)
     figure, axes = panels.grid(len(targets), 2 if len(targets) in (2, 4) else min(3, len(targets)), WIDTH, 2.0)
     for axis, (target, curves) in zip(axes, targets):
         panels.curves(axis, {level: curve.precision() for level, curve in zip(LEVELS, curves)})
@@ -238,10 +243,10 @@ def precision_recall(judged: Judged) -> Figure:
     return figure
 
 
-def _found_targets(judged: Judged) -> list[tuple[Target, tuple[Curve, ...]]]:
+def _found_targets(matched: MatchedFrames) -> list[tuple[Target, tuple[Curve, ...]]]:
     """Targets with at least one true positive, and their curves."""
-    if judged.evaluation is None:
+    if matched.evaluation is None:
         return []
-    targets = [target for metric in ("3d", "bev") for target in strictest(judged.evaluation, metric)]
-    pairs = [(target, judged.evaluation.curves(target)) for target in targets]
+    targets = [target for metric in ("3d", "bev") for target in strictest(matched.evaluation, metric)]
+    pairs = [(target, matched.evaluation.curves(target)) for target in targets]
     return [(target, curves) for target, curves in pairs if any(len(curve.thresholds) for curve in curves)]

@@ -1,4 +1,4 @@
-"""The detections of a run, judged: AP with confidence intervals, PR curves, worst mistakes with their reasons."""
+"""The detections of a run, matched: AP with confidence intervals, PR curves, worst mistakes with their reasons."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pipeline.base.errors import DataError
 from pipeline.base.paths import RunFolder
 from pipeline.data import Dataset
 from pipeline.run_folder.config import Config
-from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.run_folder.frame_outputs import FrameOutputs
 from pipeline.scoring.tables import METRIC_NAMES
 
 RESAMPLING = Resampling(resamples=200)
@@ -27,7 +27,7 @@ Verdicts = dict[tuple[str, str, int], Explanation]
 
 
 @dataclass(frozen=True)
-class Judged:
+class MatchedFrames:
     """Labels and detections of the frames that have both, and how they fit together."""
 
     labels: dict[str, list[KittiObject]] = field(default_factory=dict)
@@ -50,7 +50,7 @@ class Mistake:
     weight: float
 
 
-def judge(config: Config, run: RunFolder, dataset: Dataset, frames: Sequence[str]) -> Judged:
+def judge(config: Config, run: RunFolder, dataset: Dataset, frames: Sequence[str]) -> MatchedFrames:
     """Reads labels and detections and matches them; frames with damaged files are left out (scores name them)."""
     labels: dict[str, list[KittiObject]] = {}
     detections: dict[str, list[KittiObject]] = {}
@@ -59,19 +59,19 @@ def judge(config: Config, run: RunFolder, dataset: Dataset, frames: Sequence[str
         if not frame.has("labels") or not run.detections(frame_id).is_file():
             continue
         try:
-            pair = frame.labels, FrameFiles(run, frame_id).read_detections()
+            pair = frame.labels, FrameOutputs(run, frame_id).read_detections()
         except DataError:
             continue
         labels[frame_id], detections[frame_id] = pair
     if not labels:
-        return Judged()
+        return MatchedFrames()
     section = config.evaluation
     evaluation = prepare(labels, detections, classes=section.classes, recall=section.recall, iou_set=section.iou_set)
-    return Judged(labels, detections, evaluation, verdicts(evaluation))
+    return MatchedFrames(labels, detections, evaluation, verdicts(evaluation))
 
 
 def verdicts(evaluation: Evaluation) -> Verdicts:
-    """What became of every object in 3D at the hard level, judged by its own class at that class's strictest IoU."""
+    """What became of every object in 3D at the hard level, matched by its own class at that class's strictest IoU."""
     found: Verdicts = {}
     for target in strictest(evaluation, "3d"):
         for item in explain(evaluation.matcher, target, HARD):
@@ -89,19 +89,19 @@ def strictest(evaluation: Evaluation, metric: str) -> list[Target]:
     return list(best.values())
 
 
-def mistakes(judged: Judged) -> list[Mistake]:
+def mistakes(matched: MatchedFrames) -> list[Mistake]:
     """Missed objects and false positives, the worst first: near misses and sure false positives."""
-    scores = sorted(item.score or 0.0 for items in judged.detections.values() for item in items)
+    scores = sorted(item.score or 0.0 for items in matched.detections.values() for item in items)
     found = []
-    for (frame, side, place), verdict in judged.verdicts.items():
+    for (frame, side, place), verdict in matched.verdicts.items():
         if verdict.status not in (MISSED, FALSE_POSITIVE):
             continue
         reason = f"{verdict.reason} ({verdict.detail})" if verdict.detail else verdict.reason
         if side == "label":
-            item = judged.labels[frame][place]
+            item = matched.labels[frame][place]
             found.append(Mistake(frame, "missed", item, reason, 100.0 - item.location[2]))
         else:
-            item = judged.detections[frame][place]
+            item = matched.detections[frame][place]
             rank = bisect_right(scores, item.score or 0.0) / len(scores)
             found.append(Mistake(frame, "false", item, reason, 100.0 * rank))
     return sorted(found, key=lambda mistake: (-mistake.weight, mistake.frame))
@@ -121,11 +121,11 @@ def is_wrong(verdict: Explanation | None) -> bool:
     return verdict is not None and verdict.status in (MISSED, FALSE_POSITIVE)
 
 
-def counts_of(judged: Judged, frame: str) -> dict[str, int]:
+def counts_of(matched: MatchedFrames, frame: str) -> dict[str, int]:
     """Found, missed and false positives of a frame."""
     names = {("label", MATCHED): "found", ("label", MISSED): "missed", ("detection", FALSE_POSITIVE): "false"}
     totals = dict.fromkeys(names.values(), 0)
-    for (of, side, _), verdict in judged.verdicts.items():
+    for (of, side, _), verdict in matched.verdicts.items():
         name = names.get((side, verdict.status))
         if of == frame and name:
             totals[name] += 1
@@ -135,13 +135,13 @@ def counts_of(judged: Judged, frame: str) -> dict[str, int]:
 # --- tables
 
 
-def ap_cells(judged: Judged) -> list[list[str]]:
+def ap_cells(matched: MatchedFrames) -> list[list[str]]:
     """Rows of class, metric, IoU, AP with its interval at the three levels, and object counts."""
-    if judged.evaluation is None:
+    if matched.evaluation is None:
         return []
-    intervals = confidence_intervals(judged.evaluation, RESAMPLING)
+    intervals = confidence_intervals(matched.evaluation, RESAMPLING)
     rows = []
-    for row, start in zip(judged.evaluation.rows(), range(0, len(intervals), len(LEVELS))):
+    for row, start in zip(matched.evaluation.rows(), range(0, len(intervals), len(LEVELS))):
         if not any(row["n_gt"]):
             continue
         cells = [_interval_text(item) for item in intervals[start : start + len(LEVELS)]]
@@ -158,7 +158,7 @@ def _interval_text(item: Interval) -> str:
     return f"{item.ap:.1f} [{item.low:.0f}–{item.high:.0f}]"
 
 
-def difference_rows(first: Judged, second: Judged) -> list[list[str]]:
+def difference_rows(first: MatchedFrames, second: MatchedFrames) -> list[list[str]]:
     """AP of this run, of the other, and the paired difference with its interval, per class, metric and level; last,
     "sure" where the interval is without 0.
 
@@ -188,10 +188,10 @@ def difference_rows(first: Judged, second: Judged) -> list[list[str]]:
     ]
 
 
-def _on(judged: Judged, frames: Sequence[str], like: Evaluation) -> Evaluation:
+def _on(matched: MatchedFrames, frames: Sequence[str], like: Evaluation) -> Evaluation:
     """The evaluation on some frames, with the targets of `like`."""
-    labels = {frame: judged.labels[frame] for frame in frames}
-    part = prepare(labels, {frame: judged.detections[frame] for frame in frames})
+    labels = {frame: matched.labels[frame] for frame in frames}
+    part = prepare(labels, {frame: matched.detections[frame] for frame in frames})
     return Evaluation(part.matcher, like.targets, like.recall_points)
 
 
@@ -207,17 +207,17 @@ class CurvePanel:
     area: str
 
 
-def curve_panels(judged: Judged) -> list[CurvePanel]:
+def curve_panels(matched: MatchedFrames) -> list[CurvePanel]:
     """3D and bird's-eye curves of every class of which something was found."""
-    if judged.evaluation is None:
+    if matched.evaluation is None:
         return []
     panels = []
     for metric in ("3d", "bev"):
-        for target in strictest(judged.evaluation, metric):
-            curves = judged.evaluation.curves(target)
+        for target in strictest(matched.evaluation, metric):
+            curves = matched.evaluation.curves(target)
             paths = [(level, _curve_path(c.precision())) for level, c in zip(LEVELS, curves) if len(c.thresholds)]
             if any(c.precision().any() for c in curves if len(c.thresholds)):
-                values = judged.evaluation.average_precision(target)
+                values = matched.evaluation.average_precision(target)
                 area = " / ".join("-" if value is None else f"{value:.1f}" for value in values)
                 panels.append(CurvePanel(f"{target.cls}, {METRIC_NAMES[metric]}, IoU {target.iou:g}", paths, area))
     return panels

@@ -21,7 +21,7 @@ from pipeline.report.cloud import palettes, point_budget
 from pipeline.report.hover import hover_step
 from pipeline.report.matches import (
     CurvePanel,
-    Judged,
+    MatchedFrames,
     Mistake,
     ap_cells,
     curve_panels,
@@ -31,7 +31,7 @@ from pipeline.report.matches import (
 )
 from pipeline.report.views import Display, FrameView, MistakeView, frame_view, mistake_view
 from pipeline.run_folder.config import Config
-from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.run_folder.frame_outputs import FrameOutputs
 from pipeline.run_folder.weights import detection_weights, detector_name
 from pipeline.scoring.tables import DEPTH_NAMES, ap_header, ap_rows, depth_rows
 
@@ -64,38 +64,38 @@ def write_report(config: Config, run: RunFolder, dataset: Dataset, frames: tuple
     Raises UsageError when the run to compare with is not there.
     """
     other = other_run(config)
-    judged = judge(config, run, dataset, frames)
-    judged_other = judge(config, other, dataset, frames) if other is not None else Judged()
-    found = mistakes(judged)
+    matched = judge(config, run, dataset, frames)
+    matched_other = judge(config, other, dataset, frames) if other is not None else MatchedFrames()
+    found = mistakes(matched)
     least = score_threshold(config)
     shown = chosen_frames(frames, found, config.report.frames)
-    display = Display(hover_step(len(shown)), point_budget(len(shown)), judged, other, judged_other, least)
+    display = Display(hover_step(len(shown)), point_budget(len(shown)), matched, other, matched_other, least)
     page = Page(
-        views=[frame_view(dataset[frame_id], FrameFiles(run, frame_id), display) for frame_id in shown],
+        views=[frame_view(dataset[frame_id], FrameOutputs(run, frame_id), display) for frame_id in shown],
         total=len(frames),
         worst=worst_views(found, dataset, shown),
         n_mistakes=len(found),
-        ap=ap_cells(judged),
-        curves=curve_panels(judged),
+        ap=ap_cells(matched),
+        curves=curve_panels(matched),
         other=other,
-        differences=difference_rows(judged, judged_other),
+        differences=difference_rows(matched, matched_other),
         settings=settings_of(config),
         least=least,
     )
     write_text(run.report, render(run, page))
-    write_beside(config, run, dataset, frames, judged, least)
+    write_beside(config, run, dataset, frames, matched, least)
     return run.report
 
 
 def write_beside(
-    config: Config, run: RunFolder, dataset: Dataset, frames: tuple[str, ...], judged: Judged, least: float
+    config: Config, run: RunFolder, dataset: Dataset, frames: tuple[str, ...], matched: MatchedFrames, least: float
 ) -> list[Path]:
     """What `report.format` asks for beside the page: figures, or a recording of all frames for a viewer."""
     kind = config.report.format
     if kind in ("png", "pdf", "svg"):
         from pipeline.report.figures import write_figures
 
-        return write_figures(config, run, dataset, frames, judged, least)
+        return write_figures(config, run, dataset, frames, matched, least)
     if kind == "html":
         return []
     from pipeline.report.recordings.mcap_file import write_mcap

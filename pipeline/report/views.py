@@ -17,8 +17,8 @@ from pipeline.report import pictures
 from pipeline.report.boxes import DrawnBox, drawn_boxes
 from pipeline.report.cloud import cloud_of_frame, still_picture
 from pipeline.report.hover import HoverGrid, hover_grid
-from pipeline.report.matches import Judged, Mistake, counts_of
-from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.report.matches import MatchedFrames, Mistake, counts_of
+from pipeline.run_folder.frame_outputs import FrameOutputs
 
 PHOTO_WIDTH, MAP_WIDTH = 1242, 620
 THUMB_WIDTH, THUMB_HEIGHT = 240, 140
@@ -41,16 +41,16 @@ class Display:
 
     step    pixels between two values under the pointer
     points  most points of one cloud
-    judged  what became of labels and detections
+    matched  what became of labels and detections
     other   a second run to compare with, and its objects
     least   score from which predicted boxes are drawn at first
     """
 
     step: int
     points: int
-    judged: Judged = field(default_factory=Judged)
+    matched: MatchedFrames = field(default_factory=MatchedFrames)
     other: RunFolder | None = None
-    other_judged: Judged = field(default_factory=Judged)
+    other_matched: MatchedFrames = field(default_factory=MatchedFrames)
     least: float = -math.inf
 
 
@@ -77,10 +77,10 @@ class FrameView:
     problem: str = ""
 
 
-def frame_view(frame: Frame, files: FrameFiles, display: Display) -> FrameView:
+def frame_view(frame: Frame, files: FrameOutputs, display: Display) -> FrameView:
     """Pictures and boxes of a frame; what cannot be read is named in the view, the rest is shown."""
     view = FrameView(frame.id)
-    parts: tuple[Callable[[Frame, FrameFiles, Display, FrameView], None], ...] = (
+    parts: tuple[Callable[[Frame, FrameOutputs, Display, FrameView], None], ...] = (
         _add_photo,
         _add_maps,
         _add_boxes,
@@ -95,12 +95,12 @@ def frame_view(frame: Frame, files: FrameFiles, display: Display) -> FrameView:
     return view
 
 
-def _add_photo(frame: Frame, files: FrameFiles, display: Display, view: FrameView) -> None:
+def _add_photo(frame: Frame, files: FrameOutputs, display: Display, view: FrameView) -> None:
     view.height, view.width = frame.image_size
     view.photo = pictures.data_uri(frame.image, PHOTO_WIDTH, quality=68)
 
 
-def _add_maps(frame: Frame, files: FrameFiles, display: Display, view: FrameView) -> None:
+def _add_maps(frame: Frame, files: FrameOutputs, display: Display, view: FrameView) -> None:
     if not files.run.depth(frame.id).is_file():
         return
     completed = files.read_completed()
@@ -138,9 +138,9 @@ def error_map(caption: str, depth: NDArray[np.float32], target: NDArray[np.float
     return MapPicture(caption, uri, "error", grid)
 
 
-def _add_boxes(frame: Frame, files: FrameFiles, display: Display, view: FrameView) -> None:
+def _add_boxes(frame: Frame, files: FrameOutputs, display: Display, view: FrameView) -> None:
     def verdicts_of(side: str) -> dict[int, Any]:
-        found = display.judged.verdicts.items()
+        found = display.matched.verdicts.items()
         return {place: verdict for (of, where, place), verdict in found if of == frame.id and where == side}
 
     found = files.read_detections() if files.run.detections(frame.id).is_file() else None
@@ -148,10 +148,10 @@ def _add_boxes(frame: Frame, files: FrameFiles, display: Display, view: FrameVie
         view.truth = drawn_boxes(frame.labels, frame.calibration, frame.image_size, verdicts_of("label"), found or ())
     if found is not None:
         view.found = drawn_boxes(found, frame.calibration, frame.image_size, verdicts_of("detection"))
-        view.counts = counts_of(display.judged, frame.id) if frame.id in display.judged.labels else {}
+        view.counts = counts_of(display.matched, frame.id) if frame.id in display.matched.labels else {}
 
 
-def _add_cloud(frame: Frame, files: FrameFiles, display: Display, view: FrameView) -> None:
+def _add_cloud(frame: Frame, files: FrameOutputs, display: Display, view: FrameView) -> None:
     if files.run.counts(frame.id).is_file():
         view.steps = files.read_counts()["steps"]
     cloud = cloud_of_frame(frame, files)
@@ -174,11 +174,11 @@ def _boxes_3d(view: FrameView) -> list[dict[str, Any]]:
     ]
 
 
-def _add_other(frame: Frame, files: FrameFiles, display: Display, view: FrameView) -> None:
+def _add_other(frame: Frame, files: FrameOutputs, display: Display, view: FrameView) -> None:
     """The same frame in the run compared with: what differs, and its boxes."""
     if display.other is None:
         return
-    other = FrameFiles(display.other, frame.id)
+    other = FrameOutputs(display.other, frame.id)
     if other.run.depth(frame.id).is_file():
         depth = other.read_completed().depth
         same = files.run.depth(frame.id).is_file() and np.array_equal(depth, files.read_completed().depth)
@@ -190,7 +190,7 @@ def _add_other(frame: Frame, files: FrameFiles, display: Display, view: FrameVie
         steps = other.read_counts()["steps"]
         view.other_steps = steps if steps != view.steps else []
     if other.run.detections(frame.id).is_file():
-        found = display.other_judged.verdicts.items()
+        found = display.other_matched.verdicts.items()
         wrong = {place: v for (of, side, place), v in found if of == frame.id and side == "detection"}
         view.other = drawn_boxes(other.read_detections(), frame.calibration, frame.image_size, wrong)
 

@@ -51,7 +51,7 @@ class SynthConfig(LibrarySection):
 class CompletionConfig(Section):
     """Depth completion."""
 
-    model: str = Field(default="classical", description="embedded weights by name, a checkpoint file, or 'classical'")
+    model: str = Field(default="classical", description="bundled weights by name, a checkpoint file, or 'classical'")
     backend: str = "torch"
     device: str = "cpu"
 
@@ -72,7 +72,7 @@ class AugmentConfig(LibrarySection):
 class DetectionConfig(Section):
     """The 3D detector."""
 
-    model: str = Field(default="auto", description="embedded weights by name, a checkpoint file, or 'auto' (by preset)")
+    model: str = Field(default="auto", description="bundled weights by name, a checkpoint file, or 'auto' (by preset)")
     device: str = "cpu"
 
 
@@ -100,8 +100,8 @@ class TrainConfig(LibrarySection):
     network: Literal["completion", "detection", "segmentation"] = "completion"
     # Every n-th LiDAR ring, e.g. [1, 2, 4, 8]. Completion draws n for every crop; detection sees every frame once with
     # each n. None: the frame's sparse map, the run's clouds.
-    row_steps: tuple[int, ...] = ()
-    # With row_steps: standard deviation in degrees of a random rotation between LiDAR and camera.
+    beam_strides: tuple[int, ...] = ()
+    # With beam_strides: standard deviation in degrees of a random rotation between LiDAR and camera.
     calibration_jitter: float = 0.0
 
 

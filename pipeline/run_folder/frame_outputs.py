@@ -34,7 +34,7 @@ class Written:
 
 
 @dataclass(frozen=True)
-class FrameFiles:
+class FrameOutputs:
     """One frame's files in a run folder; every write is atomic and noted in `written` (path below the run -> hash)."""
 
     run: RunFolder

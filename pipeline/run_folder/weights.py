@@ -1,4 +1,4 @@
-"""Which weight files a run uses: embedded ones by name, or the user's by path."""
+"""Which weight files a run uses: bundled ones by name, or the user's by path."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from pipeline.run_folder.config import Config
 ROOT = Path(__file__).resolve().parent.parent.parent
 
 
-def embedded_folder(room: str) -> Path:
+def bundled_folder(room: str) -> Path:
     """The folder of the weights that come with `completion` or `detection`."""
     return ROOT / room / "weights"
 
 
-def embedded_names(room: str) -> list[str]:
-    """Names of the embedded weights of a room."""
-    return sorted(path.stem for path in embedded_folder(room).glob("*.safetensors"))
+def bundled_names(room: str) -> list[str]:
+    """Names of the bundled weights of a room."""
+    return sorted(path.stem for path in bundled_folder(room).glob("*.safetensors"))
 
 
 def completion_weights(config: Config) -> tuple[Path, ...]:
@@ -32,17 +32,17 @@ def detection_weights(config: Config) -> tuple[Path, ...]:
 
 
 def detector_name(config: Config) -> str:
-    """The detector asked for; 'auto' takes the embedded one trained on this preset's kind of cloud.
+    """The detector asked for; 'auto' takes the bundled one trained on this preset's kind of cloud.
 
-    Embedded detectors are named NETWORK_lidar (preset L) and NETWORK_augmented (all others).
+    Bundled detectors are named NETWORK_lidar (preset L) and NETWORK_augmented (all others).
     """
     name = config.detection.model
     if name != "auto":
         return name
-    names = embedded_names("detection")
+    names = bundled_names("detection")
     if not names:
         raise UsageError(
-            "no detector weights are embedded in this version: train one (--stage train --set train.network=detection) "
+            "no detector weights are bundled in this version: train one (--stage train --set train.network=detection) "
             "and give it as detection.model; a network with random weights is never used"
         )
     ending = "_lidar" if config.augment.preset == "L" else "_augmented"
@@ -62,9 +62,9 @@ def mask_weights(source: str) -> tuple[Path, ...]:
 
 
 def _files(room: str, name: str, key: str, also: str = "") -> tuple[Path, ...]:
-    """The .safetensors and the card of a path or an embedded name. Raises UsageError listing what there is."""
-    for path in (Path(name), Path(name).with_suffix(".safetensors"), embedded_folder(room) / f"{name}.safetensors"):
+    """The .safetensors and the card of a path or a bundled name. Raises UsageError listing what there is."""
+    for path in (Path(name), Path(name).with_suffix(".safetensors"), bundled_folder(room) / f"{name}.safetensors"):
         if path.is_file():
             return path, path.with_suffix(".json")
-    known = ", ".join([also, *embedded_names(room)] if also else embedded_names(room)) or "none"
-    raise UsageError(f"{key}: no weights called {name!r} (no such file; embedded: {known})")
+    known = ", ".join([also, *bundled_names(room)] if also else bundled_names(room)) or "none"
+    raise UsageError(f"{key}: no weights called {name!r} (no such file; bundled: {known})")

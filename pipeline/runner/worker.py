@@ -10,7 +10,7 @@ from pipeline.base.files import check_inside
 from pipeline.base.paths import RunFolder
 from pipeline.data import Frame
 from pipeline.run_folder.config import Config
-from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.run_folder.frame_outputs import FrameOutputs
 from pipeline.runner.jobs import Outcome, Task, outcome_of_error
 from pipeline.stages import FRAME_STAGES, FrameFunction, data_root, open_frames
 
@@ -30,7 +30,7 @@ class FrameWorker:
         except (UsageError, DataError, OSError, ValueError) as error:
             return Outcome(task, refused=str(error))
         start = time.perf_counter()
-        files = FrameFiles(self.run_folder, task.frame)
+        files = FrameOutputs(self.run_folder, task.frame)
         try:
             frame = self.dataset[task.frame]
             self._check_links(task.stage, frame)

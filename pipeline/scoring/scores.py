@@ -18,7 +18,7 @@ from pipeline.base.paths import RunFolder
 from pipeline.data import Dataset, Frame
 from pipeline.data.depth_png import read_depth_png
 from pipeline.run_folder.config import Config
-from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.run_folder.frame_outputs import FrameOutputs
 from pipeline.runner.jobs import Failure
 from pipeline.scoring.tables import markdown_tables
 
@@ -54,7 +54,7 @@ def collect(run: RunFolder, dataset: Dataset, frames: Sequence[str]) -> Collecte
     """Labels, detections, depth errors and point counts of the frames. Damage in one frame is noted, others go on."""
     collected = Collected()
     for frame_id in frames:
-        frame, files = dataset[frame_id], FrameFiles(run, frame_id)
+        frame, files = dataset[frame_id], FrameOutputs(run, frame_id)
         try:
             _collect_objects(frame, files, collected)
             _collect_depth(frame, files, collected)
@@ -69,7 +69,7 @@ def collect(run: RunFolder, dataset: Dataset, frames: Sequence[str]) -> Collecte
     return collected
 
 
-def _collect_objects(frame: Frame, files: FrameFiles, collected: Collected) -> None:
+def _collect_objects(frame: Frame, files: FrameOutputs, collected: Collected) -> None:
     if not files.run.detections(frame.id).is_file():
         return
     if not frame.has("labels"):
@@ -84,7 +84,7 @@ def _no_label(dataset: Dataset, frame_id: str) -> Failure:
     return Failure("evaluate", frame_id, "data", f"{dataset.root} frame {frame_id}", "a label file", "none", hint)
 
 
-def _collect_depth(frame: Frame, files: FrameFiles, collected: Collected) -> None:
+def _collect_depth(frame: Frame, files: FrameOutputs, collected: Collected) -> None:
     path = files.run.depth(frame.id)
     if not frame.has("target_depth") or not path.is_file():
         return

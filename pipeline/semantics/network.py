@@ -135,7 +135,7 @@ def save_segmenter(model: StreetSegmenter, out: Path, training: dict[str, Any]) 
 
 
 def load_segmenter(path_or_name: str | Path) -> NetworkSegmenter:
-    """Weights from a .safetensors file, or embedded ones by name ("street-small").
+    """Weights from a .safetensors file, or bundled ones by name ("street-small").
 
     Raises DataError when there are none, when they are not those of their card, or of another network.
     """
@@ -146,7 +146,7 @@ def load_segmenter(path_or_name: str | Path) -> NetworkSegmenter:
     path = path if path.suffix == ".safetensors" else WEIGHTS / f"{path_or_name}.safetensors"
     if not path.is_file():
         have = ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none"
-        raise DataError(path, "weights of the segmentation network", "no such file", f"embedded: {have}")
+        raise DataError(path, "weights of the segmentation network", "no such file", f"bundled: {have}")
     content = path.read_bytes()
     found, stated = hashlib.sha256(content).hexdigest(), _stated_hash(path.with_suffix(".json"))
     if found != stated:

@@ -13,7 +13,7 @@ from pipeline.geometry.rings import split_rings
 
 
 @dataclass(frozen=True, eq=False)
-class RowDrawing:
+class RandomBeamSubsampling:
     """`drawing(rng)` -> a sparse map (H, W) float32 of the frame with every n-th ring, n and the first ring drawn.
 
     steps      values of n to draw from: (1, 2, 4, 8) gives 64, 32, 16 and 8 rows
@@ -27,7 +27,7 @@ class RowDrawing:
     jitter: float
 
     @classmethod
-    def of(cls, frame: Frame, steps: tuple[int, ...], jitter: float) -> RowDrawing:
+    def of(cls, frame: Frame, steps: tuple[int, ...], jitter: float) -> RandomBeamSubsampling:
         """Splits the frame's cloud once; only points in front of the sensor are kept."""
         ahead = frame.points[:, 0] > 0
         return cls(frame, frame.points[ahead], split_rings(frame.points)[ahead], steps, jitter)

@@ -15,9 +15,9 @@ from pipeline.base.settings import plain, with_changes
 from pipeline.base.versions import made_with
 from pipeline.data import Dataset, Frame
 from pipeline.run_folder.config import Config
-from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.run_folder.frame_outputs import FrameOutputs
 from pipeline.stages import cloud_of, open_frames
-from pipeline.training.beam_subsampling import RowDrawing
+from pipeline.training.beam_subsampling import RandomBeamSubsampling
 
 if TYPE_CHECKING:
     from completion.samples import TrainingSample
@@ -34,7 +34,7 @@ class DepthSamples:
     """Frames with true depth, as `completion.train` reads them; picklable for its worker processes."""
 
     dataset: Dataset
-    row_steps: tuple[int, ...] = ()
+    beam_strides: tuple[int, ...] = ()
     calibration_jitter: float = 0.0
 
     def __len__(self) -> int:
@@ -47,9 +47,9 @@ class DepthSamples:
         frame = self.dataset[index]
         camera = frame.calibration.K if frame.has("calibration") else None
         sample = DepthFrame(frame.image, frame.sparse_depth, frame.target_depth, camera)
-        if not self.row_steps:
+        if not self.beam_strides:
             return sample
-        return TrainingSample(sample, RowDrawing.of(frame, self.row_steps, self.calibration_jitter))
+        return TrainingSample(sample, RandomBeamSubsampling.of(frame, self.beam_strides, self.calibration_jitter))
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class CloudSamples:
         from detection.types import PointFrame
 
         frame = self.dataset[index]
-        points = cloud_of(self.config, frame, FrameFiles(self.run, frame.id))
+        points = cloud_of(self.config, frame, FrameOutputs(self.run, frame.id))
         camera = frame.calibration
         return PointFrame(points, camera.T_cam_velo, camera.P2, frame.image_size, frame.id), frame.labels
 
@@ -86,8 +86,8 @@ class MaskSamples:
 
 
 def cloud_samples(dataset: Dataset, config: Config, run: RunFolder) -> LabelledFrames:
-    """The run's clouds, or with `train.row_steps` clouds of so many rows made for training alone."""
-    if not config.train.row_steps:
+    """The run's clouds, or with `train.beam_strides` clouds of so many rows made for training alone."""
+    if not config.train.beam_strides:
         return CloudSamples(dataset, config, run)
     from pipeline.training.thinned_clouds import ThinnedClouds
 
@@ -117,7 +117,7 @@ def train_completion(config: Config, dataset: Dataset, out: Path) -> Path:
     """`completion.train` on frames with true depth; the run's seed unless the section has its own."""
     from completion.models import default_spec
     from completion.train import TrainSettings, train
-    from completion.training_loss import Objective, default_kind
+    from completion.training_loss import LossSettings, default_kind
 
     if not dataset[0].has("target_depth"):
         raise UsageError(f"{dataset.root}: frame {dataset.ids[0]} has no true depth to train completion on")
@@ -125,21 +125,27 @@ def train_completion(config: Config, dataset: Dataset, out: Path) -> Path:
     # Another architecture brings its own input scaling, which single keys may still change.
     architecture = str(changes.get("model", {}).get("architecture", "twise"))
     spec = default_spec(architecture)
-    base = TrainSettings(spec, Objective(default_kind(spec)), seed=config.seed)
+    base = TrainSettings(spec, LossSettings(default_kind(spec)), seed=config.seed)
     settings = with_changes(base, changes, "train")
     held_back = min(settings.validation_frames, len(dataset) // 10) if settings.validate_every else 0
     count = len(dataset) - held_back
-    samples = DepthSamples(dataset.select(dataset.ids[:count]), config.train.row_steps, config.train.calibration_jitter)
+    samples = DepthSamples(
+        dataset.select(dataset.ids[:count]), config.train.beam_strides, config.train.calibration_jitter
+    )
     validation = [_validation_frame(dataset[frame_id], config) for frame_id in dataset.ids[count:]]
     facts = training_facts(config)
     return train(settings, samples, out, validation=validation, facts=facts, progress=print_progress)
 
 
 def _validation_frame(frame: Frame, config: Config) -> DepthFrame:
-    """A held-back frame; with `row_steps`, at 16 rows of 64 and without jitter, so that figures of runs compare."""
+    """A held-back frame; with `beam_strides`, at 16 rows of 64 and without jitter, so that figures of runs compare."""
     from completion.types import DepthFrame
 
-    sparse = RowDrawing.of(frame, (4,), 0.0)(np.random.default_rng(0)) if config.train.row_steps else frame.sparse_depth
+    sparse = (
+        RandomBeamSubsampling.of(frame, (4,), 0.0)(np.random.default_rng(0))
+        if config.train.beam_strides
+        else frame.sparse_depth
+    )
     return DepthFrame(frame.image, sparse, frame.target_depth)
 
 

@@ -1,4 +1,4 @@
-"""Clouds of fewer LiDAR rows for detector training: every frame once per entry of `train.row_steps`."""
+"""Clouds of fewer LiDAR rows for detector training: every frame once per entry of `train.beam_strides`."""
 
 from __future__ import annotations
 
@@ -62,19 +62,19 @@ class ThinnedClouds:
     run: RunFolder
 
     def __post_init__(self) -> None:
-        if any(step < 1 for step in self.config.train.row_steps):
-            raise UsageError(f"train.row_steps: expected numbers from 1, got {list(self.config.train.row_steps)}")
+        if any(step < 1 for step in self.config.train.beam_strides):
+            raise UsageError(f"train.beam_strides: expected numbers from 1, got {list(self.config.train.beam_strides)}")
         if not uses_raw_lidar(self.config) and augment_settings(self.config).needs_semantics:
-            raise UsageError("train.row_steps: clouds with object masks cannot be thinned; leave it out")
+            raise UsageError("train.beam_strides: clouds with object masks cannot be thinned; leave it out")
 
     def __len__(self) -> int:
-        return len(self.dataset) * len(self.config.train.row_steps)
+        return len(self.dataset) * len(self.config.train.beam_strides)
 
     def __getitem__(self, index: int, /) -> tuple[PointFrame, list[KittiObject]]:
         from detection.types import PointFrame
 
         frame = self.dataset[index % len(self.dataset)]
-        points = self._points(frame, self.config.train.row_steps[index // len(self.dataset)])
+        points = self._points(frame, self.config.train.beam_strides[index // len(self.dataset)])
         camera = frame.calibration
         return PointFrame(points, camera.T_cam_velo, camera.P2, frame.image_size, frame.id), frame.labels
 

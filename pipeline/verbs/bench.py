@@ -29,8 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--data", required=True, metavar="DIR", help="KITTI object folder (training/velodyne, image_2, calib, label_2)")
     add("--frames", metavar="FILE|a:b|ids", help="split file, positions, or ids separated by commas")
     add("--rows", default="32,16,8", metavar="N,N", help="LiDAR rows given to completion (default: 32,16,8)")
-    add("--completers", metavar="NAME,NAME", help="methods (default: peers, classical, all embedded); '' for none")
-    add("--detectors", metavar="NAME,NAME", help="detectors (default: all embedded); '' for none")
+    add("--completers", metavar="NAME,NAME", help="methods (default: peers, classical, all bundled); '' for none")
+    add("--detectors", metavar="NAME,NAME", help="detectors (default: all bundled); '' for none")
     add(
         "--masks",
         metavar="NAME,NAME",
@@ -86,10 +86,10 @@ def _completers(chosen: str | None) -> list[str]:
     """The methods asked for. Raises ValueError for weights that do not exist."""
     from completion.checkpoints import find_weights
     from pipeline.benchmark.suite import WITHOUT_WEIGHTS
-    from pipeline.run_folder.weights import embedded_names
+    from pipeline.run_folder.weights import bundled_names
 
     if chosen is None:
-        return [*WITHOUT_WEIGHTS, *embedded_names("completion")]
+        return [*WITHOUT_WEIGHTS, *bundled_names("completion")]
     names = [name for name in chosen.split(",") if name]
     for name in names:
         if name not in WITHOUT_WEIGHTS:
@@ -101,9 +101,9 @@ def _detection_rows(chosen: str | None, threshold: float | None) -> list[Any]:
     """Every detector on the clouds it was trained for, at 64 and at 16 rows."""
     from detection.checkpoints import find_weights, read_card
     from pipeline.benchmark.suite import DetectionRow
-    from pipeline.run_folder.weights import embedded_names
+    from pipeline.run_folder.weights import bundled_names
 
-    names = embedded_names("detection") if chosen is None else [name for name in chosen.split(",") if name]
+    names = bundled_names("detection") if chosen is None else [name for name in chosen.split(",") if name]
     rows = []
     for name in names:
         card = read_card(find_weights(name))

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.base.versions import made_with
-from pipeline.run_folder.weights import embedded_names
+from pipeline.run_folder.weights import bundled_names
 from pipeline.runner.processes import available_cores
 
 # extra of this package -> modules it brings (pyproject.toml)
@@ -64,7 +64,7 @@ def environment(folder: Path) -> dict[str, Any]:
         "disk": _disk(folder),
         "gpus": _gpus(),
         "extras": {name: all(importlib.util.find_spec(m) for m in modules) for name, modules in EXTRAS.items()},
-        "weights": {room: embedded_names(room) for room in ("completion", "detection", "pipeline/semantics")},
+        "weights": {room: bundled_names(room) for room in ("completion", "detection", "pipeline/semantics")},
     }
     return {**found, "remarks": remarks(found)}
 
@@ -84,7 +84,7 @@ def remarks(found: dict[str, Any]) -> list[str]:
     if available is not None and available < 1.5 * found["cores"]:
         notes.append(f"{available:.1f} GB of memory free for {found['cores']} processes; give fewer --workers")
     if not found["weights"]["detection"]:
-        notes.append("no detector is embedded; give one as detection.model, or stop at --stage augment")
+        notes.append("no detector is bundled; give one as detection.model, or stop at --stage augment")
     return notes
 
 

@@ -11,7 +11,7 @@ import torch
 
 from completion import backends
 from completion.checkpoints import Card, save_checkpoint
-from completion.decoding import default_read_out
+from completion.decoding import default_decoding
 from completion.infer import NetworkCompleter, load_completer
 from completion.models import build_model, default_spec
 from tests.completion.scenes import street
@@ -33,7 +33,7 @@ def saved(folder: Path, architecture: str, seed: int = 0) -> Path:
     model = build_model(spec)
     if architecture == "selection":
         torch.nn.init.normal_(model.network.head.weight, std=0.3)
-    return save_checkpoint(folder / f"{architecture}{seed}", model, Card(spec, default_read_out(spec)))
+    return save_checkpoint(folder / f"{architecture}{seed}", model, Card(spec, default_decoding(spec)))
 
 
 @pytest.mark.parametrize("backend", sorted(NEEDS))

@@ -22,7 +22,7 @@ def saved(tmp_path: Path) -> Path:
 
 def test_round_trip(saved: Path) -> None:
     model, card = load_checkpoint(saved)
-    assert (card.read_out, card.training, card.model.arguments) == ("hard", {"seed": 3}, {"width": 8})
+    assert (card.decoding, card.training, card.model.arguments) == ("hard", {"seed": 3}, {"width": 8})
     assert not model.training
     for name, value in load_file(saved).items():
         assert torch.equal(model.state_dict()[name], value)

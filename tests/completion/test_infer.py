@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from completion.checkpoints import Card, CheckpointError, save_checkpoint
-from completion.decoding import read_output
+from completion.decoding import decode_output
 from completion.infer import NetworkCompleter, load_completer
 from completion.models import build_model, default_spec
 from completion.models.classical import ClassicalCompleter, linear_inverse_depth, morphological, nearest_depth
-from completion.twin_surface import READ_OUTS, fuse
+from completion.twin_surface import DECODINGS, fuse
 from tests.completion.scenes import street
 
 SMALL = {
@@ -28,8 +28,8 @@ SMALL = {
 def completer(architecture: str, rows: int | None = None) -> NetworkCompleter:
     torch.manual_seed(0)
     spec = default_spec(architecture, **SMALL[architecture])
-    read_out = {"depth": "depth", "coefficients": "peak", "twin": "fused", "mixture": "median"}[spec.output]
-    return NetworkCompleter(build_model(spec), spec, read_out=read_out, rows=rows)
+    decoding = {"depth": "depth", "coefficients": "peak", "twin": "fused", "mixture": "median"}[spec.output]
+    return NetworkCompleter(build_model(spec), spec, decoding=decoding, rows=rows)
 
 
 @pytest.mark.parametrize("architecture", sorted(SMALL))
@@ -92,7 +92,7 @@ def test_loading_by_path(tmp_path: Path) -> None:
     path = save_checkpoint(tmp_path / "net", model, Card(spec, "hard"))
     frame = street(6, 64, 96)
     found = load_completer(str(path)).complete(frame.sparse, frame.image)
-    expected = NetworkCompleter(model, spec, read_out="hard").complete(frame.sparse, frame.image)
+    expected = NetworkCompleter(model, spec, decoding="hard").complete(frame.sparse, frame.image)
     np.testing.assert_array_equal(found.depth, expected.depth)
     assert found.sigma is not None
     assert found.foreground is not None
@@ -109,28 +109,28 @@ def test_names() -> None:
         load_completer("classical", backend="tpu")
 
 
-def test_read_outs_by_hand() -> None:
+def test_decodings_by_hand() -> None:
     near, far, sigma = np.array([2.0, 2.0]), np.array([10.0, 10.0]), np.array([0.75, 0.25])
     expected = {"fused": [4, 8], "foreground": [2, 2], "background": [10, 10], "mean": [6, 6], "hard": [2, 10]}
-    assert set(expected) == set(READ_OUTS)
+    assert set(expected) == set(DECODINGS)
     for name, values in expected.items():
         assert fuse(near, far, sigma, name).tolist() == values
         tensors = [torch.from_numpy(x) for x in (near, far, sigma)]
         assert fuse(*tensors, name).tolist() == values
-    with pytest.raises(ValueError, match="read_out"):
+    with pytest.raises(ValueError, match="decoding"):
         fuse(near, far, sigma, "best")
 
 
 def test_surfaces_are_rectified_before_mixing() -> None:
     output = torch.tensor([-0.5, 0.25, 0.0]).view(1, 3, 1, 1)
-    depth, foreground, _, _ = read_output(output, default_spec("twise"), "fused")
+    depth, foreground, _, _ = decode_output(output, default_spec("twise"), "fused")
     assert foreground is not None
     assert (float(foreground), float(depth)) == (0.0, 10.0)
 
 
-def test_read_out_must_fit_the_network() -> None:
+def test_decoding_must_fit_the_network() -> None:
     with pytest.raises(ValueError, match="offers"):
-        read_output(torch.zeros(1, 1, 2, 2), default_spec("msg_chn"), "hard")
+        decode_output(torch.zeros(1, 1, 2, 2), default_spec("msg_chn"), "hard")
 
 
 def plane(height: int = 40, width: int = 60) -> tuple[np.ndarray, np.ndarray]:

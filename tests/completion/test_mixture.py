@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from completion.decoding import MIXTURE_READ_OUTS, read_output
+from completion.decoding import MIXTURE_DECODINGS, decode_output
 from completion.losses import ale, rale
 from completion.mixture import expected_depth, negative_log_likelihood, quantiles, twin_surfaces
 from completion.models import default_spec
@@ -81,12 +81,12 @@ def test_equal_surfaces_count_their_own_candidate() -> None:
     assert float(twin_surfaces(sure)[2].min()) > 0.99
 
 
-def test_read_outs_by_hand() -> None:
+def test_decodings_by_hand() -> None:
     bimodal = mixture([0.4, 0.6], [10, 40])
     expected = {"median": 40, "expected": 28, "fused": 28, "foreground": 10, "background": 40, "mean": 25, "hard": 40}
-    assert set(expected) == set(MIXTURE_READ_OUTS)
+    assert set(expected) == set(MIXTURE_DECODINGS)
     for name, value in expected.items():
-        depth, foreground, background, sigma = read_output(bimodal, default_spec("selection"), name)
+        depth, foreground, background, sigma = decode_output(bimodal, default_spec("selection"), name)
         assert float(depth) == pytest.approx(value, rel=1e-5), name
         assert foreground is not None
         assert background is not None

@@ -1,4 +1,4 @@
-"""The embedded Depth Coefficients network: untrained it is the rings, and it starts from the selection network."""
+"""The bundled Depth Coefficients network: untrained it is the rings, and it starts from the selection network."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from completion.models import build_model, default_spec
 from completion.models.ring_coefficients import RingCoefficients, ring_coefficients
 from completion.models.rings import Rings, find_rings
 from completion.models.selection import Selection
-from completion.training_loss import Objective, training_loss
+from completion.training_loss import LossSettings, training_loss
 from tests.completion.scenes import street
 from tests.completion.test_selection import tensors
 
@@ -59,7 +59,7 @@ def test_training_lowers_the_entropy_and_reaches_every_layer() -> None:
     optimiser = torch.optim.Adam(model.parameters(), lr=2e-3)
     losses = []
     for _ in range(25):
-        loss = training_loss(model(sparse, rgb), sparse, target, spec, Objective(kind="dc"), (1.0,), 0.0)["loss"]
+        loss = training_loss(model(sparse, rgb), sparse, target, spec, LossSettings(kind="dc"), (1.0,), 0.0)["loss"]
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -78,8 +78,8 @@ def test_it_begins_with_the_layers_of_a_selection_network() -> None:
         adopt(torch.nn.Linear(2, 2), target)
 
 
-@pytest.mark.parametrize(("read_out", "threads"), [("peak", 1), ("peak", 2), ("all", 1)])
-def test_the_fast_pass_agrees_with_torch(read_out: str, threads: int) -> None:
+@pytest.mark.parametrize(("decoding", "threads"), [("peak", 1), ("peak", 2), ("all", 1)])
+def test_the_fast_pass_agrees_with_torch(decoding: str, threads: int) -> None:
     """Uneven sizes, empty and dense maps, coarse bins that near and far depths leave: the same depth to a millimetre,
     but for pixels whose two largest coefficients are equal to rounding."""
     torch.manual_seed(3)
@@ -89,10 +89,10 @@ def test_the_fast_pass_agrees_with_torch(read_out: str, threads: int) -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        fast = NetworkCompleter(model, spec, read_out=read_out, convolutions=own_kernels(model))
+        fast = NetworkCompleter(model, spec, decoding=decoding, convolutions=own_kernels(model))
     finally:
         torch.set_num_threads(before)
-    slow = NetworkCompleter(model, spec, read_out=read_out)
+    slow = NetworkCompleter(model, spec, decoding=decoding)
     for height, width, row_step in ((75, 200, 9), (64, 96, 1), (33, 131, 500)):
         frame = street(7, height, width, row_step)
         found, expected = (one.complete(frame.sparse, frame.image) for one in (fast, slow))
@@ -105,7 +105,7 @@ def test_the_fast_pass_agrees_with_torch(read_out: str, threads: int) -> None:
 
 def test_any_image_size_completes_to_one_depth() -> None:
     frame = street(2, 75, 133)
-    completer = NetworkCompleter(untrained(), default_spec("ring_coefficients", width=8), read_out="peak")
+    completer = NetworkCompleter(untrained(), default_spec("ring_coefficients", width=8), decoding="peak")
     completed = completer.complete(frame.sparse, frame.image)
     assert completed.depth.shape == (75, 133)
     assert completed.foreground is None

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from completion.checkpoints import Card, load_checkpoint, save_checkpoint
 from completion.cpu.selection import complete_mixture
-from completion.decoding import MIXTURE_READ_OUTS, read_output
+from completion.decoding import MIXTURE_DECODINGS, decode_output
 from completion.inputs import scale_rgb
 from completion.mixture import negative_log_likelihood, twin_surfaces
 from completion.models import build_model, default_spec
@@ -93,7 +93,7 @@ def test_round_trip(tmp_path: Path) -> None:
     given = tensors(street(3, 64, 96))
     with torch.inference_mode():
         assert torch.equal(loaded(*given)[0], model(*given)[0])
-    assert (card.model, card.read_out) == (spec, "median")
+    assert (card.model, card.decoding) == (spec, "median")
 
 
 def step_edge(seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -141,8 +141,8 @@ def test_gradients_reach_every_parameter() -> None:
     assert silent == []
 
 
-@pytest.mark.parametrize(("read_out", "threads"), [*((name, 1) for name in MIXTURE_READ_OUTS), ("fused", 2)])
-def test_fused_pass_agrees_with_torch(read_out: str, threads: int) -> None:
+@pytest.mark.parametrize(("decoding", "threads"), [*((name, 1) for name in MIXTURE_DECODINGS), ("fused", 2)])
+def test_fused_pass_agrees_with_torch(decoding: str, threads: int) -> None:
     """Uneven sizes, empty and dense maps, one thread or two: the same maps to 1e-5 of their value."""
     model, spec = small(4, head=0.4), default_spec("selection", width=8)
     before = torch.get_num_threads()
@@ -154,8 +154,8 @@ def test_fused_pass_agrees_with_torch(read_out: str, threads: int) -> None:
             top, right = -height % 32, -width % 32
             with torch.inference_mode():
                 (mixture,) = model(F.pad(sparse, (0, right, top, 0)), F.pad(rgb, (0, right, top, 0), mode="replicate"))
-                expected = read_output(mixture[:, :, top:, :width], spec, read_out)
-                found = complete_mixture(model, None, frame.sparse, frame.image, "standardised", read_out)
+                expected = decode_output(mixture[:, :, top:, :width], spec, decoding)
+                found = complete_mixture(model, None, frame.sparse, frame.image, "standardised", decoding)
             for one, other in zip(found, expected):
                 assert other is not None
                 np.testing.assert_allclose(one, other[0].numpy(), rtol=1e-5, atol=1e-6)

@@ -30,7 +30,7 @@ def test_logits_are_summed_where_tiles_overlap(network: tuple[torch.nn.Module, M
     """Width 80 in tiles of 48: columns 0..47 and 32..79; 32..47 belong to both."""
     model, spec = network
     frame = street(1, 32, 80)
-    found = TiledCompleter(model, spec, rows=None, read_out="all", tile_width=48).complete(frame.sparse, frame.image)
+    found = TiledCompleter(model, spec, rows=None, decoding="all", tile_width=48).complete(frame.sparse, frame.image)
     sparse = torch.from_numpy(frame.sparse)[None, None]
     rgb = torch.from_numpy(frame.image).permute(2, 0, 1)[None].float() / 255
     with torch.inference_mode():
@@ -42,7 +42,7 @@ def test_logits_are_summed_where_tiles_overlap(network: tuple[torch.nn.Module, M
 def test_one_wide_tile_is_the_whole_image(network: tuple[torch.nn.Module, ModelSpec]) -> None:
     frame = street(2, 40, 60)
     tiled = TiledCompleter(*network, rows=32, tile_width=60).complete(frame.sparse, frame.image)
-    whole = NetworkCompleter(*network, read_out="peak", rows=32).complete(frame.sparse, frame.image)
+    whole = NetworkCompleter(*network, decoding="peak", rows=32).complete(frame.sparse, frame.image)
     np.testing.assert_array_equal(tiled.depth, whole.depth)
     assert tiled.depth[:8].max() == 0
 

@@ -23,7 +23,7 @@ from completion.models import build_model, default_spec, with_rgb
 from completion.models.classical import ClassicalCompleter
 from completion.samples import Augmentation, StepBatches, disturb_image, draw_crop
 from completion.train import TrainProgress, TrainSettings, learning_rate, scales_at, train
-from completion.training_loss import Objective, pixel_weights, training_loss
+from completion.training_loss import LossSettings, pixel_weights, training_loss
 from completion.types import CompletedDepth, DepthFrame
 from tests.completion.scenes import Streets, street
 from tests.completion.training_run import settings
@@ -102,10 +102,10 @@ def table(path: Path) -> list[dict[str, str]]:
 
 
 def test_outputs_of_a_run(tmp_path: Path) -> None:
-    short = replace(settings("twise"), max_steps=4, validate_every=2, read_out="hard")
+    short = replace(settings("twise"), max_steps=4, validate_every=2, decoding="hard")
     best = train(short, Streets(5, 64, 96), tmp_path, [street(7, 64, 96)], facts={"data": "streets"})
     card = load_checkpoint(best)[1]
-    assert (card.read_out, card.training["data"]) == ("hard", "streets")
+    assert (card.decoding, card.training["data"]) == ("hard", "streets")
     assert card.training["settings"]["learning_rate"] == 1e-3
     rows = table(tmp_path / "log.csv")
     assert [row["step"] for row in rows] == ["2", "4"]
@@ -117,17 +117,17 @@ def test_outputs_of_a_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("architecture", "arguments", "objective"),
+    ("architecture", "arguments", "loss_kind"),
     [
         ("msg_chn", {"channels": 4}, "l2"),
         ("msg_chn", {"channels": 4, "extra_skips": False}, "huber"),
         pytest.param("depth_coefficients", {"count": 12, "size": 5.0}, "dc", marks=pytest.mark.slow),
     ],
 )
-def test_several_kinds_of_networks_train(tmp_path: Path, architecture: str, arguments: dict, objective: str) -> None:
+def test_several_kinds_of_networks_train(tmp_path: Path, architecture: str, arguments: dict, loss_kind: str) -> None:
     own = TrainSettings(
         default_spec(architecture, **arguments),
-        Objective(objective),
+        LossSettings(loss_kind),
         Augmentation((32, 48)),
         epochs=1,
         steps_per_epoch=2,
@@ -139,7 +139,7 @@ def test_several_kinds_of_networks_train(tmp_path: Path, architecture: str, argu
 
 
 @pytest.mark.parametrize(
-    ("architecture", "objective"),
+    ("architecture", "loss_kind"),
     [
         ("twise_resnet", "twin"),
         ("sparse_to_dense", "l1_l2"),
@@ -150,7 +150,7 @@ def test_several_kinds_of_networks_train(tmp_path: Path, architecture: str, argu
         ("resnet_dc_to_dc", "dc"),
     ],
 )
-def test_every_objective_reaches_every_parameter(architecture: str, objective: str) -> None:
+def test_every_loss_reaches_every_parameter(architecture: str, loss_kind: str) -> None:
     spec = default_spec(architecture)
     torch.manual_seed(0)
     model = build_model(spec)
@@ -159,10 +159,10 @@ def test_every_objective_reaches_every_parameter(architecture: str, objective: s
     sparse, target = (torch.from_numpy(x)[None, None] for x in (frame.sparse, frame.target))
     outputs = model(sparse / spec.depth_unit, torch.rand(1, 3, 32, 48))
     outputs = outputs if isinstance(outputs, tuple) else (outputs,)
-    parts = training_loss(outputs, sparse, target, spec, Objective(objective), (1.0,), 0.0)
+    parts = training_loss(outputs, sparse, target, spec, LossSettings(loss_kind), (1.0,), 0.0)
     parts["loss"].backward()
     assert all(p.grad is not None for p in model.parameters())
-    if objective == "dc" and len(outputs) == 2:
+    if loss_kind == "dc" and len(outputs) == 2:
         expected = parts["entropy"] + 0.8 * parts["entropy_1"]
         assert float(parts["loss"].detach()) == pytest.approx(float(expected.detach()))
 
@@ -171,7 +171,7 @@ def test_scales_and_the_sigma_term_add_up() -> None:
     spec = default_spec("twise", channels=2)
     outputs = tuple(torch.rand(1, 3, 16 // s, 16 // s) for s in (1, 2, 4))
     target = torch.rand(1, 1, 16, 16) * 40 + 1
-    parts = training_loss(outputs, 0 * target, target, spec, Objective(sigma_weight=(2.0, 0.0)), (1, 0.1, 0), 0.25)
+    parts = training_loss(outputs, 0 * target, target, spec, LossSettings(sigma_weight=(2.0, 0.0)), (1, 0.1, 0), 0.25)
     first = parts["foreground"] + parts["background"] + parts["fusion"] + 1.5 / 80 * parts["sigma"]
     assert "loss_2" not in parts
     assert float(parts["loss"]) == pytest.approx(float(first + 0.1 * parts["loss_1"]), rel=1e-6)
@@ -224,7 +224,7 @@ def test_settings_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="for a GPU"):
         TrainSettings(default_spec("twise"), precision="bf16")
     with pytest.raises(ValueError, match="gamma"):
-        Objective(gamma=0.5)
+        LossSettings(gamma=0.5)
     with pytest.raises(ValueError, match="schedule"):
         TrainSettings(default_spec("twise"), schedule="linear")
 
@@ -318,13 +318,13 @@ def test_pixel_weights() -> None:
     target[0, 0, 0, 0] = 0
     sparse = torch.zeros_like(target)
     sparse[0, 0, 3] = 20.0
-    weights = pixel_weights(sparse, target, Objective(edge_weight=4, relative_weight=1.0, above_top_ring=0.0))
+    weights = pixel_weights(sparse, target, LossSettings(edge_weight=4, relative_weight=1.0, above_top_ring=0.0))
     assert weights[0, 0, :3].max() == 0
     assert float(weights[0, 0, 5, 0]) == pytest.approx(0.5)
     assert float(weights[0, 0, 5, 7]) == pytest.approx(1.0)
     assert float(weights[0, 0, 5, 4]) == pytest.approx(5.0)
-    assert torch.equal(pixel_weights(sparse, target, Objective()), (target > 0).float())
-    assert pixel_weights(sparse, target, Objective(deepest=10.0))[..., :4].max() == 0
+    assert torch.equal(pixel_weights(sparse, target, LossSettings()), (target > 0).float())
+    assert pixel_weights(sparse, target, LossSettings(max_depth=10.0))[..., :4].max() == 0
 
 
 def test_a_step_edge_teaches_two_surfaces() -> None:

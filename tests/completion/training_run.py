@@ -15,7 +15,7 @@ import torch
 from completion.models import default_spec
 from completion.samples import Augmentation, TrainingSample
 from completion.train import TrainSettings, train
-from completion.training_loss import Objective, default_kind
+from completion.training_loss import LossSettings, default_kind
 from tests.completion.scenes import Streets, street
 
 ARGUMENTS = {"twise": {"channels": 4}, "selection": {"width": 8}}
@@ -39,7 +39,7 @@ def settings(architecture: str, accumulate: int = 2) -> TrainSettings:
     spec = default_spec(architecture, **ARGUMENTS[architecture])
     return TrainSettings(
         spec,
-        Objective(default_kind(spec)),
+        LossSettings(default_kind(spec)),
         augmentation=Augmentation((64, 64), noise=4.0, drop=0.1),
         epochs=2,
         steps_per_epoch=8,

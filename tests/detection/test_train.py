@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import torch
 
-from detection.augment import PasteSettings
 from detection.checkpoints import load_checkpoint, load_tensors, save_tensors
+from detection.data_augmentation import PasteSettings
 from detection.kitti_format import KittiObject
 from detection.optimiser import OneCycleSettings
 from detection.train import Trainer, TrainProgress, TrainSettings, frame_order, train

@@ -100,9 +100,9 @@ def test_a_data_set_without_any_label_cannot_be_evaluated(weights: Path, tmp_pat
 
 
 def test_a_random_network_is_never_used_silently(data: Path, tmp_path: Path, capsys, monkeypatch) -> None:
-    from pipeline.run_folder import weights as embedded
+    from pipeline.run_folder import weights as bundled
 
-    monkeypatch.setattr(embedded, "embedded_names", lambda room: [])
+    monkeypatch.setattr(bundled, "bundled_names", lambda room: [])
     options = ["--config", "kitti", "--data", str(data), "--out", str(tmp_path / "run"), "--stage", "detect"]
     assert main([*options, "--set", "detection.model=auto"]) == 2
     assert "a network with random weights is never used" in capsys.readouterr().err

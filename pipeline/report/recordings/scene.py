@@ -14,7 +14,7 @@ from pipeline.base.paths import RunFolder
 from pipeline.data import Dataset, Frame
 from pipeline.report import pictures
 from pipeline.report.boxes import DRAWN
-from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.run_folder.frame_outputs import FrameOutputs
 from pipeline.stages import lidar_of
 
 # Seconds between two frames in a recording: KITTI's 10 Hz.
@@ -67,7 +67,7 @@ def scenes(run: RunFolder, dataset: Dataset, frames: Sequence[str]) -> Iterator[
 
 def scene_of(run: RunFolder, frame: Frame, time: float) -> Scene:
     """One frame at `time` seconds from the start of the recording."""
-    files = FrameFiles(run, frame.id)
+    files = FrameOutputs(run, frame.id)
     if run.cloud(frame.id).is_file():
         cloud = files.read_cloud()[:, :5]
     elif frame.has("points") or frame.has("sparse_depth"):

@@ -206,7 +206,7 @@ def _first(build: Callable[[Rng], list[Part]]) -> Builder:
 
 
 # Builder and weight.
-CONFUSERS: tuple[tuple[Builder, float], ...] = (
+DISTRACTORS: tuple[tuple[Builder, float], ...] = (
     (hedge_block, 0.15),
     (shrub, 0.15),
     (bicycle_stand, 0.10),
@@ -225,10 +225,10 @@ CONFUSERS: tuple[tuple[Builder, float], ...] = (
 )
 
 
-def build_confuser(rng: Rng, detail: float) -> tuple[list[Part], tuple[float, float]]:
-    """One of CONFUSERS, centred on its footprint, and the footprint's (length, width) in metres."""
-    weights = np.array([weight for _, weight in CONFUSERS])
-    build = CONFUSERS[int(rng.choice(len(CONFUSERS), p=weights / weights.sum()))][0]
+def build_distractor(rng: Rng, detail: float) -> tuple[list[Part], tuple[float, float]]:
+    """One of DISTRACTORS, centred on its footprint, and the footprint's (length, width) in metres."""
+    weights = np.array([weight for _, weight in DISTRACTORS])
+    build = DISTRACTORS[int(rng.choice(len(DISTRACTORS), p=weights / weights.sum()))][0]
     parts = build(rng, detail)
     low, high = extent(parts)
     middle = (low + high) / 2

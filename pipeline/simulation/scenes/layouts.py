@@ -169,14 +169,14 @@ def residential(rng: np.random.Generator) -> Scene:
             busy * float(rng.beta(1.6, 1.9)),
             yaw,
         )
-        site.confusers(side * (half - 1.0), side * (half - 0.9), count=int(rng.integers(0, 4)))
+        site.distractors(side * (half - 1.0), side * (half - 0.9), count=int(rng.integers(0, 4)))
         site.boundary(side * (edge + 0.3), -50, 100)
         _houses(site, side, edge + float(rng.uniform(3, 8)), -60 + float(rng.uniform(0, 8)), 130, 5, 10, 9)
         site.trees(side * (edge + 1.8), -45, 110, float(rng.uniform(6, 18)))
         site.bushes(side * edge + side * 0.8 - 0.4, side * edge + side * 3, int(rng.integers(2, 10)))
         site.furniture_row(side * (half + 0.45), int(rng.integers(4, 12)), np.pi if side > 0 else 0.0)
         site.walkers(side * (half + 0.5), side * edge, count=int(rng.integers(0, 4)))
-        site.confusers(side * (edge + 1), side * (edge + 5), count=int(rng.integers(2, 10)))
+        site.distractors(side * (edge + 1), side * (edge + 5), count=int(rng.integers(2, 10)))
     site.traffic(0.22 * half, np.pi, _some(rng, 0.6 * busy), 12, 75, 6)
     site.traffic(-0.2 * half, 0.0, _some(rng, 0.6 * busy), 10, 75, 6)
     site.cyclists(float(rng.choice([-1, 1])) * 0.3 * half, 0.0, int(rng.integers(0, 2)))
@@ -218,7 +218,7 @@ def arterial(rng: np.random.Generator) -> Scene:
         site.trees(side * (half + walk + float(rng.uniform(0.5, 4))), -50, 120, float(rng.uniform(6, 14)))
         site.bushes(side * (half + walk + 3) - 2, side * (half + walk + 3) + 2, int(rng.integers(2, 9)))
         site.walkers(side * (half + 2.2), side * (half + walk), count=int(rng.integers(0, 4)))
-        site.confusers(side * (half + 1.0), side * (half + walk + 5), count=int(rng.integers(2, 11)))
+        site.distractors(side * (half + 1.0), side * (half + walk + 5), count=int(rng.integers(2, 11)))
         if rng.random() < 0.4:
             site.thicket(side * (half + walk + float(rng.uniform(1.5, 5))), -45, 110, (1.5, 5.0))
         elif rng.random() < 0.75:
@@ -277,7 +277,7 @@ def highway(rng: np.random.Generator) -> Scene:
             site.thicket(side * (half + verge + float(rng.uniform(2, 9))), -50, 130, (1.5, 6.0))
         site.trees(side * (half + verge + float(rng.uniform(3, 14))), -50, 130, float(rng.uniform(9, 25)), 2.5)
         site.bushes(side * (half + verge + 4) - 3, side * (half + verge + 4) + 3, int(rng.integers(3, 14)))
-        site.confusers(side * (half + verge + 1), side * (half + verge + 7), int(rng.integers(0, 6)))
+        site.distractors(side * (half + verge + 1), side * (half + verge + 7), int(rng.integers(0, 6)))
         _backdrop(site, side, half + float(rng.uniform(14, 40)))
     for s in rng.uniform(0, 100, int(rng.integers(1, 4))):
         site.put(furniture.traffic_sign(rng), float(s), -half - 2.4)
@@ -307,10 +307,10 @@ def courtyard(rng: np.random.Generator) -> Scene:
         site.walkers(side * (half - 6), side * (half - 5), count=int(rng.integers(0, 3)))
         site.furniture_row(side * (half + 0.7), int(rng.integers(3, 8)), np.pi if side > 0 else 0.0)
         site.trees(side * (half + 1.4), -30, end, float(rng.uniform(9, 20)), 0.2)
-        site.confusers(side * (half - 2), side * (half + 4), count=int(rng.integers(2, 9)))
+        site.distractors(side * (half - 2), side * (half + 4), count=int(rng.integers(2, 9)))
     if half > 11:
         site.parked_bays(0.0, 12, end - 8, busy * float(rng.uniform(0.1, 0.5)), np.pi / 2)
-    site.confusers(-half + 6, half - 6, int(rng.integers(0, 4)), 15, end)
+    site.distractors(-half + 6, half - 6, int(rng.integers(0, 4)), 15, end)
     site.put(build_house(rng, 2.2 * half, 12, float(rng.uniform(6, 14))), end + 2, 0.0, -np.pi / 2)
     site.taken.append((end + 1.5, end + 16, -half, half))
     site.traffic(-1.8, 0.0, _some(rng, 0.6 * busy), 9, end - 6, 3)
@@ -365,7 +365,7 @@ def crossing(rng: np.random.Generator) -> Scene:
         _houses(site, side, half + walk + float(rng.uniform(0.5, 8)), -50, 130, 6, 16, 8)
         site.trees(side * (half + walk + 1), -40, 110, float(rng.uniform(9, 25)))
         site.bushes(side * (half + walk + 2) - 1, side * (half + walk + 2) + 1, int(rng.integers(1, 7)))
-        site.confusers(side * (half + 1), side * (half + walk + 5), count=int(rng.integers(2, 9)))
+        site.distractors(side * (half + 1), side * (half + walk + 5), count=int(rng.integers(2, 9)))
     site.cyclists(-half + 0.7, 0.0, int(rng.integers(0, 2)))
     site.put(build_grass(rng, 6, 2.0), 8.0, -half - walk - 2)
     _skyline(site)

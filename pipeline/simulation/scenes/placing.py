@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.simulation.scenes import furniture, vegetation
-from pipeline.simulation.scenes.distractors import build_confuser
+from pipeline.simulation.scenes.distractors import build_distractor
 from pipeline.simulation.scenes.ground import Ground
 from pipeline.simulation.scenes.mesh import Part
 from pipeline.simulation.scenes.people import build_cyclist, build_pedestrian
@@ -187,15 +187,15 @@ class Site:
                 )
                 self.put(maker(self.rng), s, d + float(self.rng.normal(0, 0.08)), yaw)
 
-    def confusers(self, low_d: float, high_d: float, count: int, start: float = -8, stop: float = 60) -> None:
-        """What a detector takes for a car, see `scenes.confusers`; and trailers, which KITTI labels Misc."""
+    def distractors(self, low_d: float, high_d: float, count: int, start: float = -8, stop: float = 60) -> None:
+        """What a detector takes for a car, see `scenes.distractors`; and trailers, which KITTI labels Misc."""
         for _ in range(count):
             s, d = float(self.rng.uniform(start, stop)), self._between(low_d, high_d)
             yaw = float(self.rng.normal(0, 0.15)) + (np.pi / 2 if self.rng.random() < 0.25 else 0.0)
             if self.rng.random() < 0.06:
                 self.add(furniture.trailer(self.rng), s, d, yaw)
                 continue
-            parts, (length, width) = build_confuser(self.rng, self.detail(s, d))
+            parts, (length, width) = build_distractor(self.rng, self.detail(s, d))
             cos, sin = abs(np.cos(yaw)), abs(np.sin(yaw))
             if not self.on_crossing(s, 1.0) and self.claim(
                 s, d, length * cos + width * sin, length * sin + width * cos

@@ -98,7 +98,7 @@ def _conifer(rng: np.random.Generator, detail: float) -> list[Part]:
 
 
 def build_bush(rng: np.random.Generator, detail: float, length: float, width: float, height: float) -> list[Part]:
-    """A bush filling about this box; car-sized ones are the confusers the thesis names."""
+    """A bush filling about this box; car-sized ones are the distractors the thesis names."""
     leaves = foliage(rng)
     parts = []
     for _ in range(max(1, round(length / 0.9))):

@@ -10,7 +10,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detection.lidar_inputs import all_points, from_turned, lidar_boxes, lidar_rows, turned_boxes, turned_cloud
+from detection.lidar_inputs import (
+    all_points,
+    camera_axes_boxes,
+    camera_axes_cloud,
+    from_camera_axes,
+    lidar_boxes,
+    lidar_rows,
+)
 from detection.models.lidar_boxes import (
     limit_period,
     refined_boxes,
@@ -118,8 +125,8 @@ def tilted() -> PointFrame:
 def test_boxes_cross_the_border_and_come_back() -> None:
     frame, rng = tilted(), np.random.default_rng(0)
     boxes = np.column_stack([rng.uniform(-9, 9, (6, 3)), rng.uniform(1, 4, (6, 3)), rng.uniform(-3, 3, 6)])
-    turned = turned_boxes(boxes, frame)
-    np.testing.assert_allclose(from_turned(turned, frame).values, boxes, atol=1e-9)
+    turned = camera_axes_boxes(boxes, frame)
+    np.testing.assert_allclose(from_camera_axes(turned, frame).values, boxes, atol=1e-9)
     lidar = lidar_boxes(turned)
     np.testing.assert_allclose(to_lidar_axes(torch.from_numpy(turned))[:, :6].numpy(), lidar[:, :6], atol=1e-9)
     # heading = -(ry + pi / 2), and the centre lies half the height above the bottom.
@@ -136,7 +143,7 @@ def test_points_keep_their_place_and_order_and_boxes_hold_the_same_points() -> N
     assert places == sorted(places)
     assert len(rows) > 3000
     scene = training_scene(frame, labels, PRESETS["second_small"]())
-    cloud = turned_cloud(frame)
+    cloud = camera_axes_cloud(frame)
     np.testing.assert_array_equal(lidar_rows(cloud, scene.height, ("intensity",)), rows)
     for x, y, z, l, w, h, heading in lidar_boxes(scene.boxes).tolist():
         cos, sin = math.cos(heading), math.sin(heading)

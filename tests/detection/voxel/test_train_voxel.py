@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from detection.augment import PasteSettings
 from detection.checkpoints import load_tensors
+from detection.data_augmentation import PasteSettings
 from detection.infer import Detector, load_detector
 from detection.kitti_format import KittiObject, boxes_of
 from detection.models.batch import PointBatch

@@ -20,7 +20,7 @@ from pipeline.data import open_dataset
 from pipeline.data.dataset import Dataset
 from pipeline.export.export import export
 from pipeline.export.record import Options
-from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.run_folder.frame_outputs import FrameOutputs
 
 FRAMES = ("000003", "000004", "000007")
 VICTIM = "000004"
@@ -37,7 +37,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Path]:
         sparse = frame.sparse_depth
         near = cv2.dilate(np.divide(1, sparse, out=np.zeros_like(sparse), where=sparse > 0), np.ones((9, 9)))
         depth = np.where(sparse > 0, sparse, np.divide(1, near, out=np.zeros_like(near), where=near > 0))
-        files = FrameFiles(RunFolder(run), frame.id)
+        files = FrameOutputs(RunFolder(run), frame.id)
         files.write_completed(CompletedDepth(depth.astype(np.float32)))
         files.write_detections([replace(o, score=0.5) for o in frame.labels if o.type != "DontCare"])
         path = RunFolder(run).cloud(frame.id)

@@ -1,4 +1,4 @@
-"""The embedded network beside its L2 twin: what a row trains, and one row of each kind at budget smoke."""
+"""The bundled network beside its L2 twin: what a row trains, and one row of each kind at budget smoke."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pipeline.experiments.bundled_runs import BUDGETS, train_settings
 from pipeline.experiments.plan import Order, carry_out, gather, make_plan
 
 
-def test_twins_differ_in_nothing_but_the_loss_and_the_read_out() -> None:
+def test_twins_differ_in_nothing_but_the_loss_and_the_decoding() -> None:
     likelihood, squared = (train_settings(RECIPES[name], BUDGETS["small"], seed=1) for name in (SMALL, SMALL_L2))
-    assert (likelihood.objective.kind, squared.objective.kind) == ("mixture", "l2")
-    assert (likelihood.read_out, squared.read_out) == ("median", "expected")
-    assert replace(squared, objective=likelihood.objective, read_out=likelihood.read_out) == likelihood
+    assert (likelihood.loss.kind, squared.loss.kind) == ("mixture", "l2")
+    assert (likelihood.decoding, squared.decoding) == ("median", "expected")
+    assert replace(squared, loss=likelihood.loss, decoding=likelihood.decoding) == likelihood
 
 
 def test_one_row_of_each_kind_is_trained_and_scored(tmp_path: Path) -> None:

@@ -213,7 +213,7 @@ def test_all_rows_begin_with_one_detector(out: Path, results: Callable[[str, str
     assert Path(start).is_file()
 
 
-def test_the_common_start_sees_every_kind_of_cloud_equally_often() -> None:
+def test_the_common_pretraining_sees_every_kind_of_cloud_equally_often() -> None:
     kinds = [["L0", "L1"], ["D0", "D1"], ["L_D0", "L_D1"]]
     mixture = Mixture(kinds)  # type: ignore[arg-type]
     assert [mixture[index] for index in range(len(mixture))] == ["L0", "L1", "D0", "D1", "L_D0", "L_D1"]
@@ -221,7 +221,7 @@ def test_the_common_start_sees_every_kind_of_cloud_equally_often() -> None:
         mixture[6]
 
 
-def test_the_common_start_uses_what_the_data_has() -> None:
+def test_the_common_pretraining_uses_what_the_data_has() -> None:
     scan, truth = {"points": lambda: None}, {"target_depth": lambda: None}
     recipes = start_inputs(Frame("000001", {**scan, **truth}, "synthetic"))
     assert len({json.dumps(recipe.record(), sort_keys=True) for recipe in recipes}) == len(recipes) == 9

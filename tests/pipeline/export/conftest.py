@@ -12,7 +12,7 @@ from completion.types import CompletedDepth
 from pipeline.base.paths import RunFolder
 from pipeline.data import open_dataset
 from pipeline.data.dataset import Dataset
-from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.run_folder.frame_outputs import FrameOutputs
 from tests.pipeline.tiny_kitti import write_tiny_kitti
 
 
@@ -27,7 +27,7 @@ class TinyRun:
 
     def depth(self, name: str) -> np.ndarray:
         """(H, W) metres as the run's PNG holds it."""
-        return FrameFiles(RunFolder(self.run), name).read_completed().depth
+        return FrameOutputs(RunFolder(self.run), name).read_completed().depth
 
     def cloud(self, name: str) -> np.ndarray:
         """(N, 5) x y z intensity source."""
@@ -37,7 +37,7 @@ class TinyRun:
 def make_run(data: Path, run: Path) -> TinyRun:
     """depth/, twin/, cloud/ and detections/ of every frame of a data set."""
     for frame in open_dataset("kitti_object", data):
-        files = FrameFiles(RunFolder(run), frame.id)
+        files = FrameOutputs(RunFolder(run), frame.id)
         depth = frame.target_depth.copy()
         depth[:6] = 0
         far = np.where(depth > 0, depth + 2, 0).astype(np.float32)

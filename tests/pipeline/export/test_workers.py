@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.export.disk_buffer import Spool, write_streamed
+from pipeline.export.disk_buffer import DiskBuffer, write_streamed
 from pipeline.export.pickles import item_opcodes, write_dict_of_lists, write_list
 from pipeline.export.workers import default_workers, map_ordered
 
@@ -63,12 +63,12 @@ def test_streamed_pickles_are_ordinary_pickles() -> None:
     assert pickle.loads(buffer.getvalue()) == {"version": "1.1", "list": [{"a": [1, "x"]}, 7]}
 
 
-def test_spools_can_be_read_more_than_once() -> None:
-    spool = Spool()
+def test_disk_buffers_can_be_read_more_than_once() -> None:
+    buffer = DiskBuffer()
     for record in (b"", b"one", b"two" * 1000):
-        spool.add(record)
-    assert list(spool) == list(spool) == [b"", b"one", b"two" * 1000]
-    spool.close()
+        buffer.add(record)
+    assert list(buffer) == list(buffer) == [b"", b"one", b"two" * 1000]
+    buffer.close()
 
 
 def test_a_failing_stream_leaves_nothing_behind(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Embedded weights: figures by hand, what embedding writes, a second training beside the first, and clean cards."""
+"""Bundled weights: figures by hand, what embedding writes, a second training beside the first, and clean cards."""
 
 import json
 import re
@@ -16,7 +16,7 @@ from pipeline.pretrained.__main__ import main as embed
 from pipeline.pretrained.cards import ROOMS, without_places
 from pipeline.pretrained.figures import AT_THRESHOLD, HeldOut, operating_point, segmentation_figures
 from pipeline.run_folder.config import load_config
-from pipeline.run_folder.weights import embedded_folder
+from pipeline.run_folder.weights import bundled_folder
 from pipeline.semantics.conventions import NONE
 from pipeline.semantics.network import NetworkSegmenter
 from pipeline.simulation.synth import SynthSettings
@@ -43,13 +43,13 @@ def streets(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty package to embed into."""
-    monkeypatch.setattr(cards, "embedded_folder", lambda room: tmp_path / "package" / room / "weights")
+    monkeypatch.setattr(cards, "bundled_folder", lambda room: tmp_path / "package" / room / "weights")
     return tmp_path / "package"
 
 
 def a_run(folder: Path, room: str) -> Path:
     """A finished training run: the shipped weights and their card."""
-    source = embedded_folder(ROOMS[room]) / f"{NAMES[room]}.safetensors"
+    source = bundled_folder(ROOMS[room]) / f"{NAMES[room]}.safetensors"
     target = folder / "weights" / room / "model.safetensors"
     target.parent.mkdir(parents=True)
     shutil.copyfile(source, target)
@@ -67,9 +67,7 @@ def test_places_become_names() -> None:
     assert without_places(card) == expected
 
 
-SHIPPED = [
-    (room, path) for room in sorted(ROOMS) for path in sorted(embedded_folder(ROOMS[room]).glob("*.safetensors"))
-]
+SHIPPED = [(room, path) for room in sorted(ROOMS) for path in sorted(bundled_folder(ROOMS[room]).glob("*.safetensors"))]
 
 
 @pytest.mark.parametrize(("room", "weights"), SHIPPED, ids=[path.stem for _, path in SHIPPED])
@@ -103,7 +101,7 @@ def test_a_run_is_embedded_and_measured_again(room: str, tmp_path: Path, package
     run = a_run(tmp_path / "run", room)
     assert embed([room, str(run), "mine", "--data", str(streets), *MADE]) == 0
     weights = package / ROOMS[room] / "weights" / "mine.safetensors"
-    shipped = embedded_folder(ROOMS[room]) / f"{NAMES[room]}.safetensors"
+    shipped = bundled_folder(ROOMS[room]) / f"{NAMES[room]}.safetensors"
     assert weights.read_bytes() == shipped.read_bytes()
     card = json.loads(weights.with_suffix(".json").read_text())
     assert (card["name"], card["held_out"]["frames"], card["seed"], card["hours"]) == ("mine", 2, 5, 0.25)
@@ -154,7 +152,7 @@ def test_segmentation_figures_by_hand(streets: Path, monkeypatch: pytest.MonkeyP
     dataset = open_dataset("kitti_object", streets)
     classes = np.concatenate([frame.semantics.ravel() for frame in dataset])
     counted = classes[classes != NONE]
-    figures = segmentation_figures(embedded_folder(ROOMS["segmentation"]) / "street-small.safetensors", dataset)
+    figures = segmentation_figures(bundled_folder(ROOMS["segmentation"]) / "street-small.safetensors", dataset)
     assert figures["pixel_accuracy"] == pytest.approx(np.mean(counted == 13), abs=1e-4)
     assert figures["vehicle_iou"] == pytest.approx(np.isin(counted, [13, 14, 15]).mean(), abs=1e-4)
     assert 0 < figures["pixel_accuracy"] < 0.5

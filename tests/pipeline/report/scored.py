@@ -13,7 +13,7 @@ from pipeline.data import open_dataset
 from pipeline.pointcloud.augment import AugmentedCloud
 from pipeline.report.page import write_report
 from pipeline.run_folder.config import load_config
-from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.run_folder.frame_outputs import FrameOutputs
 from pipeline.scoring.scores import evaluate_run
 from tests.pipeline.tiny_kitti import write_tiny_kitti
 
@@ -25,7 +25,7 @@ def write_run(folder: Path, name: str, error: float) -> RunFolder:
         write_tiny_kitti(data, 3)
     run = RunFolder(folder / name)
     for frame in open_dataset("kitti_object", data):
-        files = FrameFiles(run, frame.id)
+        files = FrameOutputs(run, frame.id)
         depth = frame.target_depth
         files.write_completed(CompletedDepth(depth + error, depth, depth + 2, np.full_like(depth, 0.5)))
         source = np.arange(len(frame.points)) % 2

@@ -11,7 +11,7 @@ from pipeline.base.paths import RunFolder
 from pipeline.data import open_dataset
 from pipeline.report import cloud as clouds
 from pipeline.report.hover import NOTHING, hover_grid, hover_step
-from pipeline.run_folder.frame_outputs import FrameFiles
+from pipeline.run_folder.frame_outputs import FrameOutputs
 
 
 def random_cloud(measured: int, completed: int) -> clouds.FrameCloud:
@@ -57,7 +57,7 @@ def test_a_page_shares_its_points() -> None:
 
 def test_colours_of_a_frame_with_truth(run: RunFolder) -> None:
     frame = open_dataset("kitti_object", run.root.parent / "kitti")[0]
-    cloud = clouds.frame_cloud(frame, FrameFiles(run, frame.id))
+    cloud = clouds.frame_cloud(frame, FrameOutputs(run, frame.id))
     assert cloud is not None
     assert list(cloud.bytes) == ["source", "sigma", "class", "noise"]
     measured = cloud.measured

@@ -14,7 +14,7 @@ from pipeline.base.errors import UsageError
 from pipeline.base.paths import RunFolder
 from pipeline.report.boxes import drawn_boxes
 from pipeline.report.matches import (
-    Judged,
+    MatchedFrames,
     Mistake,
     ap_cells,
     counts_of,
@@ -33,21 +33,21 @@ def car(x: float, z: float, score: float | None = None) -> KittiObject:
     return KittiObject("Car", 0.0, 0, 0.0, (100 + x, 100, 200 + x, 160), (1.5, 1.6, 4.0), (x, 1.6, z), 0.0, score)
 
 
-def judged(labels: dict[str, list[KittiObject]], detections: dict[str, list[KittiObject]]) -> Judged:
+def matched(labels: dict[str, list[KittiObject]], detections: dict[str, list[KittiObject]]) -> MatchedFrames:
     evaluation = prepare(labels, detections, classes=("Car",), iou_set="strict")
-    return Judged(labels, detections, evaluation, verdicts(evaluation))
+    return MatchedFrames(labels, detections, evaluation, verdicts(evaluation))
 
 
 @pytest.fixture
-def example() -> Judged:
+def example() -> MatchedFrames:
     """Frame a: one found, one missed at 10 m, one false; frame b: one missed at 30 m, one sure false."""
-    return judged(
+    return matched(
         {"a": [car(0, 20), car(8, 10)], "b": [car(0, 30)]},
         {"a": [car(0, 20, 0.9), car(-20, 25, 0.2)], "b": [car(-15, 40, 0.8)]},
     )
 
 
-def test_mistakes_come_worst_first_with_their_reason(example: Judged) -> None:
+def test_mistakes_come_worst_first_with_their_reason(example: MatchedFrames) -> None:
     found = mistakes(example)
     # Weights: missed 100 - 10 and 100 - 30; false by the rank of the score among three: 2/3 and 1/3.
     assert [(item.frame, item.kind, round(item.weight, 1)) for item in found] == [
@@ -62,13 +62,13 @@ def test_mistakes_come_worst_first_with_their_reason(example: Judged) -> None:
     assert counts_of(example, "b") == {"found": 0, "missed": 1, "false": 1}
 
 
-def test_verdicts_name_the_place_in_the_list(example: Judged) -> None:
+def test_verdicts_name_the_place_in_the_list(example: MatchedFrames) -> None:
     assert example.verdicts["a", "label", 0].status == "matched"
     assert verdict_text(example.verdicts["a", "label", 1]) == "missed: no detection overlaps"
     assert verdict_text(None) == ""
 
 
-def test_a_found_label_knows_the_score_that_found_it(example: Judged) -> None:
+def test_a_found_label_knows_the_score_that_found_it(example: MatchedFrames) -> None:
     verdicts_of_a = {place: verdict for (frame, side, place), verdict in example.verdicts.items()
                      if (frame, side) == ("a", "label")}  # fmt: skip
     boxes = drawn_boxes(example.labels["a"], CALIBRATION, (400, 960), verdicts_of_a, example.detections["a"])
@@ -78,16 +78,16 @@ def test_a_found_label_knows_the_score_that_found_it(example: Judged) -> None:
     assert example.verdicts["a", "detection", 1].partner == 0
 
 
-def test_ap_comes_with_its_interval(example: Judged) -> None:
+def test_ap_comes_with_its_interval(example: MatchedFrames) -> None:
     cells = {row[1]: row for row in ap_cells(example)}
     assert set(cells) == {"2D box", "orientation", "bird's eye", "3D box"}
     value = re.fullmatch(r"([\d.]+) \[(\d+)–(\d+)\]", cells["3D box"][3])
     assert value is not None
     assert float(value[2]) - 0.5 <= float(value[1]) <= float(value[3]) + 0.5
-    assert ap_cells(Judged()) == []
+    assert ap_cells(MatchedFrames()) == []
 
 
-def test_curves_reach_as_far_as_the_recall(example: Judged) -> None:
+def test_curves_reach_as_far_as_the_recall(example: MatchedFrames) -> None:
     panel = curve_panels(example)[0]
     assert panel.title == "Car, 3D box, IoU 0.7"
     numbers = [float(text) for text in re.findall(r"-?[\d.]+", dict(panel.paths)["easy"])]
@@ -96,14 +96,14 @@ def test_curves_reach_as_far_as_the_recall(example: Judged) -> None:
     assert numbers[-2:] == [100.0, 100.0]  # recall 100 % is never reached
 
 
-def test_a_run_differs_from_another_by_its_ap(example: Judged) -> None:
-    better = judged(example.labels, {"a": [car(0, 20, 0.9), car(8, 10, 0.8)], "b": [car(0, 30, 0.7)]})
+def test_a_run_differs_from_another_by_its_ap(example: MatchedFrames) -> None:
+    better = matched(example.labels, {"a": [car(0, 20, 0.9), car(8, 10, 0.8)], "b": [car(0, 30, 0.7)]})
     rows = difference_rows(better, example)
     assert {row[1] for row in rows} == {"3D box", "bird's eye"}
     for row in rows:
         assert float(row[4]) > float(row[5])
         assert row[6].startswith(f"{float(row[4]) - float(row[5]):+.1f}")
-    assert difference_rows(better, Judged()) == []
+    assert difference_rows(better, MatchedFrames()) == []
 
 
 def test_shown_frames_are_the_worst_and_some_others() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.simulation.scenes import surfaces as S
-from pipeline.simulation.scenes.distractors import CONFUSERS, Builder, build_confuser
+from pipeline.simulation.scenes.distractors import DISTRACTORS, Builder, build_distractor
 from pipeline.simulation.scenes.furniture import bins, clutter, fence, phone_box, skip, traffic_light, trailer, wall
 from pipeline.simulation.scenes.ground import Road
 from pipeline.simulation.scenes.layouts import LAYOUTS, draw_scene
@@ -85,7 +85,7 @@ def test_other_labelled_things_fill_their_boxes(build: object, rng: Rng) -> None
     assert model.label in ("Pedestrian", "Cyclist", "Truck", "Misc")
 
 
-def test_clutter_stands_on_the_ground_and_confusers_are_of_car_size(rng: Rng) -> None:
+def test_clutter_stands_on_the_ground_and_distractors_are_of_car_size(rng: Rng) -> None:
     for make in (bins, phone_box, skip, clutter, traffic_light):
         low, _ = extent(make(rng))
         assert -0.01 <= low[2] < 0.4
@@ -97,8 +97,8 @@ def test_clutter_stands_on_the_ground_and_confusers_are_of_car_size(rng: Rng) ->
         assert np.isfinite(part.vertices).all()
 
 
-@pytest.mark.parametrize("build", [build for build, _ in CONFUSERS])
-def test_confusers_stand_on_the_ground_in_the_size_of_what_they_are_taken_for(build: Builder, rng: Rng) -> None:
+@pytest.mark.parametrize("build", [build for build, _ in DISTRACTORS])
+def test_distractors_stand_on_the_ground_in_the_size_of_what_they_are_taken_for(build: Builder, rng: Rng) -> None:
     for detail in (1.0, 0.1):
         parts = build(rng, detail)
         low, high = extent(parts)
@@ -110,9 +110,9 @@ def test_confusers_stand_on_the_ground_in_the_size_of_what_they_are_taken_for(bu
         assert all(part.surface.train_id != S.CAR for part in parts)
 
 
-def test_confuser_is_centred_on_its_footprint(rng: Rng) -> None:
+def test_distractor_is_centred_on_its_footprint(rng: Rng) -> None:
     for _ in range(20):
-        parts, (length, width) = build_confuser(rng, 0.3)
+        parts, (length, width) = build_distractor(rng, 0.3)
         low, high = extent(parts)
         np.testing.assert_allclose((high - low)[:2], (length, width))
         np.testing.assert_allclose((high + low)[:2], 0, atol=1e-9)

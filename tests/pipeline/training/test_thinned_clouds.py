@@ -19,7 +19,7 @@ from tests.pipeline.tiny_kitti import write_tiny_kitti
 
 
 def config(root: Path, **augment: object) -> Config:
-    train = {"network": "detection", "row_steps": [1, 4]}
+    train = {"network": "detection", "beam_strides": [1, 4]}
     return parse_config({"data": {"name": "kitti_object", "root": str(root)}, "train": train, "augment": augment}, "t")
 
 
@@ -64,10 +64,12 @@ def test_masks_and_bad_steps_are_refused(root: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="object masks"):
         ThinnedClouds(dataset, config(root, preset="L_D_SF_mask", semantics="truth"), run)
     bad = config(root, preset="L")
-    with pytest.raises(UsageError, match="row_steps"):
-        ThinnedClouds(dataset, bad.model_copy(update={"train": bad.train.model_copy(update={"row_steps": (0,)})}), run)
+    with pytest.raises(UsageError, match="beam_strides"):
+        ThinnedClouds(
+            dataset, bad.model_copy(update={"train": bad.train.model_copy(update={"beam_strides": (0,)})}), run
+        )
 
 
-def test_without_row_steps_the_runs_own_clouds(root: Path, tmp_path: Path) -> None:
+def test_without_beam_strides_the_runs_own_clouds(root: Path, tmp_path: Path) -> None:
     plain = parse_config({"data": {"name": "kitti_object", "root": str(root)}}, "t")
     assert isinstance(cloud_samples(open_dataset("kitti_object", root), plain, RunFolder(tmp_path)), CloudSamples)

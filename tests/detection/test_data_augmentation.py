@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from detection.augment import (
+from detection.data_augmentation import (
     PasteSettings,
     SceneAugmentation,
     TrainingScene,
