@@ -16,20 +16,14 @@ from pipeline.base.settings import nearest_name
 from pipeline.base.versions import made_with
 from pipeline.data import Dataset
 from pipeline.run_folder.config import Config, dump_config, load_config
+from pipeline.run_folder.frames import data_root, has_points, open_frames
+from pipeline.run_folder.preset import augment_settings
 from pipeline.runner.batch import Batch, StageSummary, open_batch, shard_of
 from pipeline.runner.failures import update_failures
 from pipeline.runner.jobs import Outcome, Task
 from pipeline.runner.processes import available_cores
 from pipeline.runner.signals import StopRequest, stop_on_signals
-from pipeline.stages import (
-    FRAME_STAGES,
-    STAGES,
-    augment_settings,
-    data_root,
-    frame_stages_for,
-    has_points,
-    open_frames,
-)
+from pipeline.stages.order import FRAME_STAGES, STAGES, frame_stages_for
 from pipeline.summary import print_dry_run, print_results, print_summary, run_record
 
 DONE, SOME_FAILED, REFUSED = 0, 1, 2

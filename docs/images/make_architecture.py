@@ -51,7 +51,7 @@ def drawing() -> str:
             250,
             110,
             blue,
-            "pipeline/stages.py",
+            "pipeline/stages/",
             "complete · augment · detect:",
             "each read, call, write",
             "evaluate: scoring.py",

@@ -114,7 +114,7 @@ def _has_rings(frame: Frame) -> bool:
 def lidar_points(frame: Frame, rows: int) -> NDArray[np.float32]:
     """(N, 4) raw returns of every (64 / rows)-th ring. UsageError where the points are in no scan order."""
     from pipeline.geometry.rings import subsample_rows
-    from pipeline.stages import lidar_of
+    from pipeline.stages.clouds import lidar_of
 
     points = lidar_of(frame)
     if rows == FULL_ROWS:
@@ -145,7 +145,7 @@ def make_input(
     """
     from completion.types import CompletedDepth
     from pipeline.pointcloud.augment import augment_frame
-    from pipeline.stages import with_sigma
+    from pipeline.stages.clouds import with_sigma
 
     settings = recipe.settings
     if depth is None:

@@ -13,6 +13,7 @@ from pipeline.base.paths import RunFolder
 from pipeline.base.progress import Counter, progress
 from pipeline.data import Dataset
 from pipeline.run_folder.config import Config
+from pipeline.run_folder.frames import open_frames
 from pipeline.runner.budget import DiskBudget
 from pipeline.runner.jobs import Outcome, Task
 from pipeline.runner.keys import stage_key, task_key
@@ -20,7 +21,7 @@ from pipeline.runner.ledger import Ledger, Row
 from pipeline.runner.processes import LocalEngine, WorkerFactory, available_cores
 from pipeline.runner.signals import StopRequest
 from pipeline.runner.worker import FrameWorker
-from pipeline.stages import FRAME_STAGES, open_frames
+from pipeline.stages.order import FRAME_STAGES
 
 
 class Engine(Protocol):

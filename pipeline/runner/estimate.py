@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from pipeline.runner.batch import Batch
 from pipeline.runner.processes import available_cores
-from pipeline.stages import FRAME_STAGES
+from pipeline.stages.order import FRAME_STAGES
 
 _FILES_PER_FRAME = {"complete": 2, "augment": 2, "detect": 1}
 

@@ -11,8 +11,10 @@ from pipeline.base.paths import RunFolder
 from pipeline.data import Frame
 from pipeline.run_folder.config import Config
 from pipeline.run_folder.frame_outputs import FrameOutputs
+from pipeline.run_folder.frames import data_root, open_frames
 from pipeline.runner.jobs import Outcome, Task, outcome_of_error
-from pipeline.stages import FRAME_STAGES, FrameFunction, data_root, open_frames
+from pipeline.stages.order import FRAME_STAGES
+from pipeline.stages.stage import FrameFunction
 
 
 class FrameWorker:

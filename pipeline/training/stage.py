@@ -16,7 +16,8 @@ from pipeline.base.versions import made_with
 from pipeline.data import Dataset, Frame
 from pipeline.run_folder.config import Config
 from pipeline.run_folder.frame_outputs import FrameOutputs
-from pipeline.stages import cloud_of, open_frames
+from pipeline.run_folder.frames import open_frames
+from pipeline.stages.clouds import cloud_of
 from pipeline.training.beam_subsampling import RandomBeamSubsampling
 
 if TYPE_CHECKING:

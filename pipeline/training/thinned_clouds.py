@@ -22,8 +22,9 @@ from pipeline.data import Dataset, Frame
 from pipeline.geometry.project import project_points
 from pipeline.geometry.rings import subsample_rows
 from pipeline.run_folder.config import Config
+from pipeline.run_folder.preset import augment_settings, uses_raw_lidar
 from pipeline.run_folder.weights import completion_weights
-from pipeline.stages import augment_settings, uses_raw_lidar, with_sigma
+from pipeline.stages.clouds import with_sigma
 
 if TYPE_CHECKING:
     from completion.infer import Completer

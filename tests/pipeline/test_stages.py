@@ -13,7 +13,7 @@ from pipeline.base.errors import UsageError
 from pipeline.base.paths import RunFolder, safe_id
 from pipeline.cli import main
 from pipeline.run_folder.config import Config, load_config
-from pipeline.stages import frame_stages_for
+from pipeline.stages.order import frame_stages_for
 from tests.pipeline.tiny_kitti import write_tiny_kitti
 
 
@@ -209,7 +209,8 @@ def test_a_stage_runs_what_it_needs_and_nothing_after(stage, changes, has_points
 
 def test_sparse_depth_of_labelled_frames_serves_as_lidar() -> None:
     from pipeline.data import Dataset, Frame
-    from pipeline.stages import has_points, lidar_of
+    from pipeline.run_folder.frames import has_points
+    from pipeline.stages.clouds import lidar_of
     from tests.pipeline.tiny_kitti import CALIBRATION
 
     sparse = np.zeros((48, 96), np.float32)

@@ -15,7 +15,7 @@ from pipeline.data import Dataset, Frame
 from pipeline.report import pictures
 from pipeline.report.boxes import DRAWN
 from pipeline.run_folder.frame_outputs import FrameOutputs
-from pipeline.stages import lidar_of
+from pipeline.stages.clouds import lidar_of
 
 # Seconds between two frames in a recording: KITTI's 10 Hz.
 PERIOD = 0.1

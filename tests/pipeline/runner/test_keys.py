@@ -55,7 +55,7 @@ def test_parts_without_files_are_recognised_by_content() -> None:
 
 def test_code_versions_differ_between_rooms() -> None:
     assert code_version("completion") != code_version("detection")
-    assert code_version("pipeline/stages.py") == code_version("pipeline/stages.py")
+    assert code_version("pipeline/stages/order.py") == code_version("pipeline/stages/order.py")
 
 
 def test_seeds_depend_on_run_frame_and_stage() -> None:
