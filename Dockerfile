@@ -13,6 +13,7 @@ RUN apt-get update \
 
 WORKDIR /opt/auglidar
 COPY pyproject.toml setup.py README.md LICENSE ./
+COPY auglidar_base auglidar_base
 COPY completion completion
 COPY detection detection
 COPY pipeline pipeline

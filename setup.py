@@ -3,6 +3,6 @@
 from setuptools import find_packages, setup
 
 setup(
-    packages=[*find_packages(include=["completion*", "detection*", "pipeline*"]), "pipeline.configs"],
+    packages=[*find_packages(include=["auglidar_base*", "completion*", "detection*", "pipeline*"]), "pipeline.configs"],
     package_dir={"pipeline.configs": "configs"},
 )

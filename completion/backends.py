@@ -16,7 +16,8 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from completion.checkpoints import Card, write_atomically
+from auglidar_base.atomic import write_bytes
+from completion.checkpoints import Card
 from completion.cpu import hourglass as hourglass_cpu
 from completion.cpu.pixel_unet import PixelUNetKernels
 from completion.models.hourglass import Hourglasses
@@ -99,7 +100,7 @@ def exported(model: nn.Module, card: Card) -> bytes:
     graph = export_onnx(model)
     if card.sha256:
         try:
-            write_atomically(path, graph)
+            write_bytes(path, graph)
         except OSError as error:
             warnings.warn(f"{path}: the exported network is not kept: {error}", RuntimeWarning, stacklevel=2)
     return graph

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -20,10 +19,12 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import nn
 
+from auglidar_base.atomic import write_bytes
+from auglidar_base.errors import CheckpointError
 from completion.decoding import default_decoding
 from completion.importers import import_checkpoint, import_with_spec
 from completion.models import ModelSpec, build_model
-from completion.state_dicts import CheckpointError, fill, match
+from completion.state_dicts import fill, match
 
 __all__ = [
     "Card",
@@ -54,17 +55,6 @@ class Card:
     sha256: str = ""
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that a reader sees the old or the new content, never a part; survives a kill at any moment."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with open(temporary, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-
-
 def save_checkpoint(path: str | Path, model: nn.Module, card: Card) -> Path:
     """Write PATH.safetensors and PATH.json (any suffix of `path` is replaced); returns the safetensors path."""
     weights_path = Path(path).with_suffix(".safetensors")
@@ -77,8 +67,8 @@ def save_checkpoint(path: str | Path, model: nn.Module, card: Card) -> Path:
         "decoding": card.decoding,
         "training": dict(card.training),
     }
-    write_atomically(weights_path, content)
-    write_atomically(weights_path.with_suffix(".json"), json.dumps(described, indent=1).encode())
+    write_bytes(weights_path, content)
+    write_bytes(weights_path.with_suffix(".json"), json.dumps(described, indent=1).encode())
     return weights_path
 
 

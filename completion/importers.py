@@ -1,16 +1,11 @@
 """Reading the published checkpoint files of TWISE, MSG-CHN and sparse-to-dense without running anything in them.
 
-These are pickles of PyTorch 0.4 to 1.3, legacy or zip. They are read by torch's restricted unpickler; the classes they
-mention beside tensors (argparse.Namespace, metrics.Result, NumPy scalars, optimisers) are replaced by inert stand-ins
-that hold nothing and run nothing. A file that *calls* an unknown function while loading is refused.
+These are pickles of PyTorch 0.4 to 1.3, legacy or zip; `auglidar_base.torch_pickle` reads them.
 """
 
 from __future__ import annotations
 
 import hashlib
-import pickle
-import re
-from collections import defaultdict
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,94 +13,17 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from auglidar_base.errors import CheckpointError
+from auglidar_base.torch_pickle import read_torch_pickle
 from completion.models import ModelSpec, build_model, default_spec
-from completion.state_dicts import CheckpointError, Match, fill, match
+from completion.state_dicts import Match, fill, match
 
 ARCHITECTURES = ("twise", "twise_maxpool", "msg_chn", "msg_chn_wacv", "sparse_to_dense")
-_NOT_ALLOWED = re.compile(r"GLOBAL ([\w.]+) was not an allowed global")
-_MOST_CLASSES = 40
-
-
-class _NeverCalled(type):
-    """Metaclass of the stand-ins: instances may be made by unpickling (`__new__`), but not by a call from the file."""
-
-    def __call__(cls, *args: Any, **kwargs: Any) -> Any:
-        raise pickle.UnpicklingError(f"the file calls {cls.__qualname__}")
-
-
-def _stand_in(full_name: str) -> type:
-    """An inert class that is unpickled in place of `full_name`; state is thrown away."""
-
-    def create(cls: type, *args: Any, **kwargs: Any) -> Any:
-        return object.__new__(cls)
-
-    def set_state(self: Any, state: Any) -> None:
-        return None
-
-    return _NeverCalled(full_name, (), {"__new__": create, "__setstate__": set_state, "__slots__": ()})
-
-
-def _nothing(*args: Any) -> None:
-    """Stands in for the constructors of NumPy scalars, which the files call: metrics, never weights."""
-    return None
-
-
-_NUMPY = [
-    (_nothing, f"{package}.multiarray.{name}")
-    for package in ("numpy.core", "numpy._core")
-    for name in ("scalar", "_reconstruct")
-]
-
-
-# Calling these makes an empty container; whole optimisers hold them.
-_CONTAINERS = [(defaultdict, "collections.defaultdict")] + [
-    (container, f"{module}.{container.__name__}")
-    for module in ("builtins", "__builtin__")
-    for container in (dict, set, list)
-]
-
-
-class _Dtype:
-    """Stands in for numpy.dtype."""
-
-    def __init__(self, *args: Any) -> None: ...
-
-    def __setstate__(self, state: Any) -> None:
-        return None
-
-
-def read_pickle(path: str | Path) -> Any:
-    """Contents of a PyTorch file, legacy or zip, with stand-ins for every class that is not a tensor or container.
-
-    CheckpointError when the file calls a function, is damaged, or is no PyTorch file. Nothing in it is executed.
-    """
-    stand_ins: list[Any] = [*_NUMPY, *_CONTAINERS, (_Dtype, "numpy.dtype")]
-    seen: set[str] = set()
-    for _ in range(_MOST_CLASSES):
-        try:
-            with torch.serialization.safe_globals(stand_ins):
-                return torch.load(path, map_location="cpu", weights_only=True)
-        except pickle.UnpicklingError as error:
-            named = _NOT_ALLOWED.search(str(error))
-            if named is None or named.group(1) in seen:
-                raise CheckpointError(f"{path}: refused, nothing in it was executed: {_reason(error)}") from error
-            seen.add(named.group(1))
-            stand_ins.append((_stand_in(named.group(1)), named.group(1)))
-        except (RuntimeError, EOFError, ValueError, KeyError, AttributeError, TypeError) as error:
-            raise CheckpointError(f"{path}: not a readable PyTorch file: {error}") from error
-    raise CheckpointError(f"{path}: refused: it mentions more than {_MOST_CLASSES} classes")
-
-
-def _reason(error: Exception) -> str:
-    """The sentence of torch's long message that names the culprit."""
-    sentences = re.split(r"\n|\. ", str(error))
-    telling = [s.strip() for s in sentences if re.search(r"calls|GLOBAL|REDUCE|blocked|NEWOBJ|BUILD", s)]
-    return telling[0] if telling else sentences[0].strip()
 
 
 def read_tensors(path: str | Path) -> dict[str, Tensor]:
     """The network's tensors by name, one leading `module.` removed. CheckpointError when there are none."""
-    content = read_pickle(path)
+    content = read_torch_pickle(path)
     if isinstance(content, Mapping):
         for key in ("model", "net", "state_dict"):
             if isinstance(content.get(key), Mapping):

@@ -11,7 +11,8 @@ from safetensors import safe_open
 from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
-from completion.checkpoints import CheckpointError, write_atomically
+from auglidar_base.atomic import write_bytes
+from auglidar_base.errors import CheckpointError
 
 FORMAT = "auglidar-completion-run-1"
 
@@ -31,7 +32,7 @@ def save_state(
     tensors["random/torch"] = torch.get_rng_state()
     header = {"format": FORMAT, "facts": facts, "optimiser_numbers": numbers, "scaler": scaler.state_dict()}
     stored = {name: value.cpu().contiguous() for name, value in tensors.items()}
-    write_atomically(path, save_tensors(stored, {"run": json.dumps(header)}))
+    write_bytes(path, save_tensors(stored, {"run": json.dumps(header)}))
 
 
 def load_state(

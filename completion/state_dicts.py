@@ -7,9 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
-
-class CheckpointError(ValueError):
-    """A weights file that cannot be used: which file, what was expected, what came."""
+from auglidar_base.errors import CheckpointError
 
 
 @dataclass(frozen=True)

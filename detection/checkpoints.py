@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,20 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from auglidar_base.atomic import write_bytes
 from detection.models.presets import PRESETS, Preset
 
 WEIGHTS = Path(__file__).parent / "weights"
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that readers see the old or the new content, never a part (temporary file, fsync, rename)."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with temporary.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> str:
@@ -33,7 +22,7 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[st
     from safetensors.torch import save
 
     content = save({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, dict(metadata or {}))
-    write_atomically(path, content)
+    write_bytes(path, content)
     return hashlib.sha256(content).hexdigest()
 
 
@@ -63,7 +52,7 @@ def save_checkpoint(model: nn.Module, preset: Preset, path: str | Path, facts: M
         "sha256": digest,
         **facts,
     }
-    write_atomically(path.with_suffix(".json"), (json.dumps(card, indent=2, sort_keys=True) + "\n").encode())
+    write_bytes(path.with_suffix(".json"), (json.dumps(card, indent=2, sort_keys=True) + "\n").encode())
     return path
 
 

@@ -1,104 +1,27 @@
 """Reading the public detector checkpoints without running anything in them.
 
-They are pickles. torch's restricted unpickler reads them; classes beside tensors and containers (configuration objects,
-optimiser scalars) are replaced by inert stand-ins that keep nothing. A file that calls a function is refused.
+They are pickles; `auglidar_base.torch_pickle` reads them.
 """
 
 from __future__ import annotations
 
-import pickle
 import re
-import warnings
-from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from auglidar_base.torch_pickle import read_torch_pickle
 from detection.models.lidar_presets import OPENPCDET_PRESETS, openpcdet_features
 from detection.models.openpcdet_pointrcnn import OpenPCDetPointRCNN
 from detection.models.presets import pointrcnn, pointrcnn2
 
-_NOT_ALLOWED = re.compile(r"GLOBAL ([\w.]+) was not an allowed global")
-_MOST_CLASSES = 30
-
-
-class _NeverCalled(type):
-    """Metaclass of the stand-ins: unpickling may make instances, a call from the file is refused."""
-
-    def __call__(cls, *args: Any, **kwargs: Any) -> Any:
-        raise pickle.UnpicklingError(f"the file calls {cls.__qualname__}")
-
-
-def _stand_in(full_name: str) -> type:
-    """An inert class read in place of `full_name`; its state is thrown away."""
-
-    def create(cls: type, *args: Any, **kwargs: Any) -> Any:
-        return object.__new__(cls)
-
-    def forget(self: Any, *state: Any) -> None:
-        return None
-
-    return _NeverCalled(full_name, (), {"__new__": create, "__setstate__": forget, "__slots__": ()})
-
-
-def _nothing(*args: Any) -> None:
-    """In place of NumPy's scalar constructor: optimiser states hold such numbers, weights never."""
-    return None
-
-
-class _Dtype:
-    """In place of numpy.dtype, which such scalars name."""
-
-    def __init__(self, *args: Any) -> None: ...
-
-    def __setstate__(self, state: Any) -> None:
-        return None
-
-
-_CONTAINERS: list[Any] = [
-    OrderedDict,
-    (defaultdict, "collections.defaultdict"),
-    (_nothing, "numpy.core.multiarray.scalar"),
-    (_nothing, "numpy._core.multiarray.scalar"),
-    (_Dtype, "numpy.dtype"),
-]
-
-
-def read_pickle(path: str | Path) -> Any:
-    """The content of a PyTorch file, legacy or zip. Raises ValueError when it calls a function or cannot be read."""
-    allowed = list(_CONTAINERS)
-    seen: set[str] = set()
-    while len(seen) < _MOST_CLASSES:
-        try:
-            with torch.serialization.safe_globals(allowed), warnings.catch_warnings():
-                # A file of an unusual pickle protocol is still read, or refused below.
-                warnings.filterwarnings("ignore", message="Detected pickle protocol")
-                return torch.load(path, map_location="cpu", weights_only=True)
-        except pickle.UnpicklingError as error:
-            named = _NOT_ALLOWED.search(str(error))
-            if named is None or named.group(1) in seen:
-                raise ValueError(f"{path}: refused, nothing in it was executed: {_reason(error)}") from error
-            seen.add(named.group(1))
-            allowed.append((_stand_in(named.group(1)), named.group(1)))
-        except (RuntimeError, ValueError, EOFError, KeyError, AttributeError, TypeError, IndexError) as error:
-            raise ValueError(f"{path}: expected a PyTorch checkpoint, cannot read it: {error}") from error
-    raise ValueError(f"{path}: refused: it mentions more than {_MOST_CLASSES} classes")
-
-
-def _reason(error: Exception) -> str:
-    """The sentence of torch's long message that names the culprit."""
-    sentences = [part.strip() for part in re.split(r"\n|\. ", str(error))]
-    telling = [part for part in sentences if re.search(r"calls|GLOBAL|REDUCE|blocked|NEWOBJ|BUILD|persistent", part)]
-    return (telling or sentences)[0][:300]
-
 
 def read_tensors(path: str | Path) -> dict[str, Tensor]:
     """The tensors of `model_state`, `state_dict` or a bare state dict; a leading `module.` is taken off."""
-    content = read_pickle(path)
+    content = read_torch_pickle(path)
     if isinstance(content, Mapping):
         for key in ("model_state", "state_dict", "model"):
             if isinstance(content.get(key), Mapping):

@@ -7,7 +7,7 @@ import io
 from pathlib import Path
 from typing import Any
 
-from detection.checkpoints import write_atomically
+from auglidar_base.atomic import write_bytes
 
 
 class TrainingLog:
@@ -21,7 +21,7 @@ class TrainingLog:
         kept = [row for row in rows if row and (row[0] == "step" or int(row[0]) <= done)]
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows(kept)
-        write_atomically(self.path, text.getvalue().encode())
+        write_bytes(self.path, text.getvalue().encode())
         self.board = _tensorboard(folder)
 
     def write(self, step: int, values: dict[str, float]) -> None:

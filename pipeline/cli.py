@@ -71,7 +71,7 @@ def _run_stages(args: argparse.Namespace, arguments: Sequence[str]) -> int:
     import json
     from pathlib import Path
 
-    from pipeline.base.atomic import write_text
+    from auglidar_base.atomic import write_text
     from pipeline.run import Request, carry_out
 
     overrides = list(args.overrides)

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.base.atomic import remove_leftovers, write_text
+from auglidar_base.atomic import remove_leftovers, write_text
 from pipeline.base.errors import UsageError
 from pipeline.base.paths import RunFolder
 from pipeline.base.settings import nearest_name

@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.base.atomic import write_text
+from auglidar_base.atomic import write_text
 from pipeline.base.errors import UsageError
 from pipeline.base.progress import progress
 from pipeline.base.settings import plain, with_changes

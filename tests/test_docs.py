@@ -25,7 +25,7 @@ from tests.pipeline.tiny_kitti import write_tiny_kitti
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([*ROOT.glob("docs/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"])
 FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
-ROOMS = ("completion", "detection", "pipeline", "benchmarks")
+ROOMS = ("auglidar_base", "completion", "detection", "pipeline", "benchmarks")
 
 pages = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
@@ -130,7 +130,7 @@ def resolves(name: str) -> bool:
 @pages
 def test_named_functions_exist(page: Path) -> None:
     for code in re.findall(r"`([^`\n]+)`", prose(page)):
-        name = re.match(rf"((?:{'|'.join(ROOMS[:3])})(?:\.\w+)+)", code)
+        name = re.match(rf"((?:{'|'.join(ROOMS[:4])})(?:\.\w+)+)", code)
         # completion.model and the like are keys of the configuration.
         if name is None or name.group(1).split(".")[1] in ("model", "device", "backend"):
             continue

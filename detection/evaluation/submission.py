@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import zipfile
 from pathlib import Path
 
+from auglidar_base.atomic import replacing
 from detection.evaluation.objects import ALPHA, BBOX, SCORE
 from detection.evaluation.protocol import KITTI_CLASSES
 from detection.evaluation.reading import Problems, frame_names, read_table
@@ -67,17 +67,11 @@ def write_archive(folder: Path, archive: Path, frames: int = TEST_FRAMES) -> Pat
 
     Appears by atomic rename. Check the folder with `check_submission` first.
     """
-    archive.parent.mkdir(parents=True, exist_ok=True)
-    partial = archive.with_name(f".{archive.name}.{os.getpid()}")
-    try:
-        with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as packed:
-            for index in range(frames):
-                path = folder / f"{index:06d}.txt"
-                entry = zipfile.ZipInfo(path.name, date_time=(1980, 1, 1, 0, 0, 0))
-                entry.compress_type = zipfile.ZIP_DEFLATED
-                entry.external_attr = 0o644 << 16
-                packed.writestr(entry, path.read_bytes() if path.exists() else b"")
-        os.replace(partial, archive)
-    finally:
-        partial.unlink(missing_ok=True)
+    with replacing(archive) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as packed:
+        for index in range(frames):
+            path = folder / f"{index:06d}.txt"
+            entry = zipfile.ZipInfo(path.name, date_time=(1980, 1, 1, 0, 0, 0))
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.external_attr = 0o644 << 16
+            packed.writestr(entry, path.read_bytes() if path.exists() else b"")
     return archive

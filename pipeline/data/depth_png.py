@@ -64,6 +64,6 @@ def png_bytes(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
 
 def write_depth_png(path: str | Path, depth: NDArray[np.floating]) -> None:
     """Writes (H, W) metres as a 16-bit depth PNG; the file appears complete or not at all."""
-    from pipeline.base.atomic import write_bytes
+    from auglidar_base.atomic import write_bytes
 
     write_bytes(Path(path), depth_png_bytes(depth))

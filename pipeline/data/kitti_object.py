@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from auglidar_base.atomic import write_bytes, write_text
 from detection.kitti_format import KittiObject, format_line, parse_lines
-from pipeline.base.atomic import write_bytes, write_text
 from pipeline.base.errors import DataError, UsageError
 from pipeline.base.files import read_bytes, read_text
 from pipeline.data.dataset import Dataset

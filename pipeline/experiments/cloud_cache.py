@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.base.atomic import write_bytes, write_text
+from auglidar_base.atomic import write_bytes, write_text
 from pipeline.base.errors import DataError, UsageError
 from pipeline.base.paths import RunFolder, safe_id
 from pipeline.data import Dataset, Frame

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from auglidar_base.atomic import write_bytes
 from detection.boxes import corners
 from detection.kitti_format import KittiObject, boxes_of
-from pipeline.base.atomic import write_bytes
 from pipeline.base.errors import DataError
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.base.atomic import write_text
+from auglidar_base.atomic import write_text
 from pipeline.experiments.catalogue import find
 from pipeline.experiments.finding import Finding
 from pipeline.experiments.intervals import FAILS, HOLDS, UNKNOWN, Verdict

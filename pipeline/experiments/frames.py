@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.atomic import write_bytes
+from auglidar_base.atomic import write_bytes
 from pipeline.base.errors import UsageError
 from pipeline.experiments.budgets import CompletionBudget
 from pipeline.runner.keys import code_version

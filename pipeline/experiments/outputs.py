@@ -7,7 +7,7 @@ import io
 import math
 from pathlib import Path
 
-from pipeline.base.atomic import write_text
+from auglidar_base.atomic import write_text
 from pipeline.experiments.intervals import Estimate, estimate
 from pipeline.experiments.plan import Order, TableResult
 from pipeline.experiments.runs import available

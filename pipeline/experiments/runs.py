@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from pipeline.base.atomic import remove_leftovers, write_text
+from auglidar_base.atomic import remove_leftovers, write_text
 from pipeline.base.errors import UsageError
 from pipeline.base.settings import nearest_name, plain, with_changes
 from pipeline.base.versions import made_with

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from auglidar_base.atomic import write_text
 from detection.evaluation.difficulty import DifficultyRule, KittiDifficulty, Vkitti2Difficulty
 from detection.evaluation.objects import Array, Mask
-from pipeline.base.atomic import write_text
 from pipeline.base.errors import UsageError
 from pipeline.data import Dataset, open_dataset
 from pipeline.runner.keys import code_version

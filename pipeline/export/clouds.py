@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from pipeline.base.atomic import write_bytes
+from auglidar_base.atomic import write_bytes
 from pipeline.data.cloud_files import Cloud, pcd_bytes, ply_bytes
 from pipeline.export.record import Options, Record
 from pipeline.export.source import ExportFrame

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import secrets
 import struct
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from pipeline.base.atomic import TEMPORARY_PREFIX
+from auglidar_base.atomic import replacing
 
 
 class DiskBuffer:
@@ -39,14 +37,5 @@ class DiskBuffer:
 
 def write_streamed(path: Path, write: Callable[[BinaryIO], None]) -> None:
     """A file that `write` fills piece by piece and that appears complete or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.parent / f"{TEMPORARY_PREFIX}{os.getpid()}-{secrets.token_hex(4)}"
-    try:
-        with open(temporary, "xb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with replacing(path) as temporary, open(temporary, "xb") as file:
+        write(file)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from pipeline.base.atomic import write_text
+from auglidar_base.atomic import write_text
 from pipeline.base.errors import DataError, UsageError
 from pipeline.base.paths import RunFolder
 from pipeline.data.dataset import Dataset

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from auglidar_base.atomic import write_bytes
 from detection.kitti_format import KittiObject
-from pipeline.base.atomic import write_bytes
 from pipeline.data.depth_png import png_bytes
 from pipeline.data.kitti_object import write_calibration, write_objects, write_velodyne
 from pipeline.export.record import Options, Record

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from auglidar_base.atomic import write_bytes, write_text
 from detection.boxes import wrap_angle
 from detection.kitti_format import KittiObject, boxes_of
-from pipeline.base.atomic import write_bytes, write_text
 from pipeline.data.kitti_object import write_velodyne
 from pipeline.export.disk_buffer import DiskBuffer, write_streamed
 from pipeline.export.geometry import boxes_in_lidar, in_image, points_in_box

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.atomic import write_bytes
+from auglidar_base.atomic import write_bytes
 from pipeline.data.lidar_like import pixels_to_velo
 from pipeline.export.geometry import depth_pixels, in_image
 from pipeline.export.kitti_tree import write_kitti_frame

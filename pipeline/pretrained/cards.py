@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pipeline.base.atomic import write_text
+from auglidar_base.atomic import write_text
 from pipeline.base.errors import UsageError
 from pipeline.data import open_dataset
 from pipeline.pretrained.figures import AT_THRESHOLD, HeldOut

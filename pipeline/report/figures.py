@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from auglidar_base.atomic import write_bytes
 from completion.types import CompletedDepth
 from detection.evaluation.curves import Curve
 from detection.evaluation.difficulty import LEVELS
 from detection.evaluation.protocol import Target
 from detection.kitti_format import KittiObject
-from pipeline.base.atomic import write_bytes
 from pipeline.base.errors import DataError
 from pipeline.base.paths import RunFolder
 from pipeline.data import Dataset, Frame

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.base.atomic import write_text
+from auglidar_base.atomic import write_text
 from pipeline.base.errors import UsageError
 from pipeline.base.paths import RunFolder
 from pipeline.base.versions import made_with

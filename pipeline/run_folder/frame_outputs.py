@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from auglidar_base.atomic import write_bytes
 from completion.types import CompletedDepth
 from detection.kitti_format import KittiObject, format_line
-from pipeline.base.atomic import write_bytes
 from pipeline.base.errors import DataError
 from pipeline.base.paths import RunFolder
 from pipeline.data.depth_png import decode_depth, depth_png_bytes, encode_depth, read_depth_png

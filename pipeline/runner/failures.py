@@ -6,7 +6,7 @@ import json
 import shlex
 from collections.abc import Sequence
 
-from pipeline.base.atomic import write_text
+from auglidar_base.atomic import write_text
 from pipeline.base.paths import RunFolder
 from pipeline.runner.jobs import Failure
 from pipeline.runner.ledger import all_failures

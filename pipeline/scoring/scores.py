@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from auglidar_base.atomic import write_text
 from detection.kitti_format import KittiObject
-from pipeline.base.atomic import write_text
 from pipeline.base.errors import DataError
 from pipeline.base.paths import RunFolder
 from pipeline.data import Dataset, Frame

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from pipeline.base.atomic import write_bytes
+from auglidar_base.atomic import write_bytes
 from pipeline.base.errors import DataError
 from pipeline.semantics.conventions import CLASSES
 

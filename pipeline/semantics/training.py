@@ -16,10 +16,10 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from auglidar_base.atomic import write_text
 from completion.resume import load_state, save_state
 from completion.samples import Augmentation, disturb_image
 from completion.train import TrainProgress
-from pipeline.base.atomic import write_text
 from pipeline.semantics.conventions import CLASSES, NONE
 from pipeline.semantics.network import LabelledImage, StreetSegmenter, image_tensor, save_segmenter
 

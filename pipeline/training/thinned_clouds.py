@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.atomic import write_bytes
+from auglidar_base.atomic import write_bytes
 from pipeline.base.errors import UsageError
 from pipeline.base.paths import RunFolder
 from pipeline.base.seeds import derive_seed

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from pipeline.base.atomic import write_text
+from auglidar_base.atomic import write_text
 from pipeline.base.errors import UsageError
 
 COLUMNS = ("mae", "rmse", "tmae", "trmse", "mixed", "mixed_all", "edge_tmae", "missing", "seconds")

@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _show(target: str | None, record: dict[str, object], lines: list[str]) -> None:
     """The report as text, as JSON on the screen, or as text with JSON in a file."""
-    from pipeline.base.atomic import write_text
+    from auglidar_base.atomic import write_text
 
     text = json.dumps(record, indent=1)
     if target == "-":

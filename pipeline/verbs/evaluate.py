@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
+
+from auglidar_base.atomic import write_text
 
 if TYPE_CHECKING:
     from detection.evaluation.bootstrap import Resampling
@@ -259,11 +260,7 @@ def _write(place: str | None, text: Callable[[], str]) -> None:
     if place == "-":
         sys.stdout.write(text())
         return
-    path = Path(place)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    partial.write_text(text(), encoding="utf-8")
-    os.replace(partial, path)
+    write_text(Path(place), text())
 
 
 def main() -> int:

@@ -13,6 +13,7 @@ import pytest
 import torch
 from torch import nn
 
+from auglidar_base.torch_pickle import read_torch_pickle
 from detection.checkpoints import (
     find_weights,
     import_checkpoint,
@@ -21,7 +22,7 @@ from detection.checkpoints import (
     save_checkpoint,
     save_tensors,
 )
-from detection.importers import import_with_report, read_pickle
+from detection.importers import import_with_report
 from detection.models.openpcdet_pointrcnn import OpenPCDetPointRCNN
 from detection.models.presets import pointrcnn, pointrcnn2, small
 
@@ -169,10 +170,10 @@ def test_a_pickle_that_calls_is_refused_and_not_run(tmp_path, legacy) -> None:
     content = {"model_state": {"w": torch.zeros(2)}, "extra": Command(f"touch {witness}")}
     torch.save(content, path, _use_new_zipfile_serialization=not legacy)
     with pytest.raises(ValueError, match="refused, nothing in it was executed"):
-        read_pickle(path)
+        read_torch_pickle(path)
     path.write_bytes(pickle.dumps(Command(f"touch {witness}")))
     with pytest.raises(ValueError, match=r"a\.pth"):
-        read_pickle(path)
+        read_torch_pickle(path)
     assert not witness.exists()
 
 
@@ -187,7 +188,7 @@ class Plain:
 
 def test_foreign_classes_become_inert(tmp_path) -> None:
     torch.save({"state_dict": {"w": torch.ones(2)}, "args": Plain(), "best": np.float64(0.5)}, tmp_path / "a.pth")
-    content = read_pickle(tmp_path / "a.pth")
+    content = read_torch_pickle(tmp_path / "a.pth")
     assert torch.equal(content["state_dict"]["w"], torch.ones(2))
     assert not isinstance(content["args"], Plain)
     assert not hasattr(content["args"], "rate")
@@ -196,7 +197,7 @@ def test_foreign_classes_become_inert(tmp_path) -> None:
 def test_no_checkpoint_at_all(tmp_path) -> None:
     (tmp_path / "a.pth").write_bytes(b"not a checkpoint")
     with pytest.raises(ValueError, match=r"a\.pth"):
-        read_pickle(tmp_path / "a.pth")
+        read_torch_pickle(tmp_path / "a.pth")
     torch.save({"epoch": 3}, tmp_path / "b.pth")
     with pytest.raises(ValueError, match="found no tensor"):
         import_checkpoint(tmp_path / "b.pth", "pointrcnn")

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import base64
 import json
-import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from auglidar_base.atomic import replacing
 from pipeline.base.errors import UsageError
 from pipeline.report.recordings.scene import BOX_COLOURS, PERIOD, Scene, SceneBox
 from pipeline.report.recordings.schemas import SCHEMAS
@@ -39,9 +39,7 @@ def write_mcap(path: Path, scenes: Iterable[Scene], name: str) -> Path:
         from mcap.writer import CompressionType, Writer
     except ImportError:
         raise UsageError("report.format mcap needs mcap: pip install 'auglidar[viewer]'") from None
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{os.getpid()}-{path.name}")
-    with open(temporary, "wb") as file:
+    with replacing(path) as temporary, open(temporary, "wb") as file:
         # Clouds and JPEGs hardly compress, and without compression no further package is needed to read the file.
         writer = Writer(file, compression=CompressionType.NONE)
         writer.start(profile="", library="auglidar")
@@ -53,7 +51,6 @@ def write_mcap(path: Path, scenes: Iterable[Scene], name: str) -> Path:
                 data = json.dumps(message, separators=(",", ":")).encode()
                 writer.add_message(channels[topic], nanoseconds, data, nanoseconds, sequence=index)
         writer.finish()
-    os.replace(temporary, path)
     return path
 
 

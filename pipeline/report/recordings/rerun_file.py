@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from auglidar_base.atomic import replacing
 from pipeline.base.errors import UsageError
 from pipeline.report.recordings.scene import BOX_COLOURS, Scene
 
@@ -21,10 +21,8 @@ def write_rrd(path: Path, scenes: Iterable[Scene], name: str) -> Path:
         import rerun as rr
     except ImportError:
         raise UsageError("report.format rrd needs rerun-sdk: pip install 'auglidar[viewer]'") from None
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{os.getpid()}-{path.name}")
     # The same run gives the same recording id, so that a newer file replaces the older one in the viewer.
-    with rr.RecordingStream(APPLICATION, recording_id=name) as recording:
+    with replacing(path) as temporary, rr.RecordingStream(APPLICATION, recording_id=name) as recording:
         recording.save(temporary)
         recording.log("world", rr.ViewCoordinates.FLU, static=True)
         for index, scene in enumerate(scenes):
@@ -33,7 +31,6 @@ def write_rrd(path: Path, scenes: Iterable[Scene], name: str) -> Path:
             _log(recording, scene)
         recording.flush()
         recording.disconnect()
-    os.replace(temporary, path)
     return path
 
 

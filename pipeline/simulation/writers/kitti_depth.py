@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.atomic import write_bytes, write_text
+from auglidar_base.atomic import write_bytes, write_text
 from pipeline.data.depth_png import depth_png_bytes, png_bytes
 from pipeline.geometry.calibration import Calibration
 from pipeline.geometry.project import project_points

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from auglidar_base.atomic import write_bytes, write_text
 from detection.kitti_format import format_line
-from pipeline.base.atomic import write_bytes, write_text
 from pipeline.data.depth_png import depth_png_bytes, png_bytes
 from pipeline.geometry.calibration import format_calibration
 

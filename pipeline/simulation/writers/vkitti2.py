@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from auglidar_base.atomic import write_bytes, write_text
 from detection.boxes import observation_angle
 from detection.types import Boxes3D
-from pipeline.base.atomic import write_bytes, write_text
 from pipeline.data.depth_png import png_bytes
 from pipeline.geometry.calibration import Calibration
 

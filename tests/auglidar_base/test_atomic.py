@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.base import atomic
-from pipeline.base.atomic import remove_leftovers, write_bytes, write_text
+from auglidar_base import atomic
+from auglidar_base.atomic import remove_leftovers, replacing, write_bytes, write_text
 
 
 def test_contents_and_folders(tmp_path: Path) -> None:
@@ -40,3 +40,20 @@ def test_leftovers_of_a_killed_run_go_but_not_those_of_a_running_one(tmp_path: P
     os.utime(old, (time.time() - 7200,) * 2)
     assert remove_leftovers(tmp_path) == 1
     assert (old.exists(), fresh.exists()) == (False, True)
+
+
+def test_a_block_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "a.bin"
+    with replacing(path) as temporary:
+        temporary.write_bytes(b"old")
+        assert not path.exists()
+
+    def fail() -> None:
+        with replacing(path) as temporary:
+            temporary.write_bytes(b"half")
+            raise RuntimeError("stopped")
+
+    with pytest.raises(RuntimeError, match="stopped"):
+        fail()
+    assert path.read_bytes() == b"old"
+    assert list(path.parent.iterdir()) == [path]
