@@ -1,4 +1,4 @@
-"""Completion networks: plain eager torch beside every backend, int8, operations, bytes and the machine's limit.
+"""Completion networks: plain eager torch beside every backend, operations, bytes and the machine's limit.
 
     python -m benchmarks.completion --threads 2
 
@@ -24,13 +24,12 @@ from torch import Tensor, nn
 from benchmarks.pointcloud_frame import street_frame
 from benchmarks.record import Measure, measure_of, save
 from benchmarks.street_twise import cropped, given, street_twise
-from benchmarks.targets import EAGER, FASTEST, LOSS
+from benchmarks.targets import EAGER
 from benchmarks.timing import Comparison, compare, format_table
 from completion.backends import export_onnx, onnxruntime_session, openvino_session, own_kernels
 from completion.checkpoints import load_checkpoint
 from completion.infer import NetworkCompleter
 from completion.models import ModelSpec, default_spec
-from completion.quantise import quantised_convolutions
 from completion.types import DepthFrame
 
 OWN = "ours (numba)"
@@ -110,36 +109,13 @@ def backends(graph: bytes) -> dict[str, Callable[..., Tensor]]:
     return found
 
 
-def timed_modes(title: str, runs: dict[str, Callable[[], Tensor]], repeats: int) -> list[Comparison]:
-    """Ours at fp32 beside every other way at fp32, then int8 beside plain eager torch."""
-
-    def within_1_mm(a: Tensor, b: Tensor) -> bool:
-        return millimetres(a, b) < 1.0
-
-    exact = {name: run for name, run in runs.items() if name not in (OWN, "int8")}
-    rows = [compare(f"{title}, fp32", runs[OWN], exact, repeats, within_1_mm)]
-    if "int8" in runs:
-        rows.append(compare(f"{title}, int8", runs["int8"], {EAGER: runs[EAGER]}, min(repeats, 2)))
-    return rows
-
-
-def millimetres(a: Tensor, b: Tensor) -> float:
-    """Largest difference of the surfaces of two outputs of TWISE."""
-    return 80e3 * float((a - b)[:, :2].abs().max())
-
-
-def fastest_mode(rows: list[Comparison], losses: dict[str, float]) -> list[Measure]:
-    """The fastest of our modes among those that cost less than 1 % of MAE, beside plain eager torch; and that cost."""
-    modes = {row.name.split(", ")[-1]: row for row in rows}
-    fit = {mode: row for mode, row in modes.items() if losses[mode] < 1}
-    mode, row = max(fit.items(), key=lambda item: item[1].ratio(EAGER))
-    eager = next(peer.median for peer in row.peers if peer.label == EAGER)
-    print(f"fastest mode under 1 % of MAE: {mode}, {row.ratio(EAGER):.2f} times faster than eager\n")
-    return [Measure(FASTEST, row.ours.median, "s", {EAGER: eager}), Measure(LOSS, losses[mode], "%")]
+def within_1_mm(a: Tensor, b: Tensor) -> bool:
+    """Whether no surface of two outputs of TWISE differs by more."""
+    return 80e3 * float((a - b)[:, :2].abs().max()) < 1.0
 
 
 def twise_measures(channels: int, size: tuple[int, int], repeats: int, limits: dict[str, float]) -> list[Measure]:
-    """The large network: eager, other runtimes, what `backend="auto"` takes, int8."""
+    """The large network: eager, other runtimes, what `backend="auto"` takes."""
     spec = default_spec("twise", channels=channels)
     rows, columns = min(size[0], 160), min(size[1], 400)
     seen = [cropped(one, rows, columns, 200 * left) for left, one in enumerate(streets(4, first=40))]
@@ -149,7 +125,7 @@ def twise_measures(channels: int, size: tuple[int, int], repeats: int, limits: d
     work, traffic, products = work_of(model, tuple(sparse.shape), tuple(rgb.shape))
     ways: dict[str, Callable[..., Tensor]] = {EAGER: lambda *inputs: model(*inputs)[0], OWN: own_kernels(model)}
     if find_spec("onnx") and find_spec("onnxruntime"):
-        ways |= backends(export_onnx(model)) | {"int8": quantised_convolutions(model, spec, seen)}
+        ways |= backends(export_onnx(model))
     last = copy.deepcopy(model).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     ways["torch, channels last"] = lambda depth, colour: last(
         depth, colour.contiguous(memory_format=torch.channels_last)
@@ -161,18 +137,16 @@ def twise_measures(channels: int, size: tuple[int, int], repeats: int, limits: d
             apart = 80e3 * (run() - reference)[:, :2].abs()
             print(f"{name}: mean {float(apart.mean()):.3f} mm, at most {float(apart.max()):.3f} mm from eager")
         title = f"TWISE-{channels}, {size[0]}x{size[1]}"
-        table = timed_modes(title, runs, repeats)
-        errors = {mode: surface_mae(ways[name], frames) for mode, name in MODES.items() if name in ways}
-    print(f"\n{format_table(table)}")
-    losses = {mode: 100 * (error / errors["eager"] - 1) for mode, error in errors.items()}
-    costs = ", ".join(f"{mode} {errors[mode]:.1f} mm ({loss:+.2f} %)" for mode, loss in losses.items())
+        peers = {name: run for name, run in runs.items() if name != OWN}
+        row = compare(f"{title}, fp32", runs[OWN], peers, repeats, within_1_mm)
+        errors = {name: surface_mae(ways[name], frames) for name in (EAGER, OWN)}
+    print(f"\n{format_table([row])}")
+    costs = ", ".join(
+        f"{name} {error:.1f} mm ({100 * (error / errors[EAGER] - 1):+.2f} %)" for name, error in errors.items()
+    )
     print(f"MAE on {len(frames)} streets: {costs}")
-    fastest = fastest_mode(table, losses)
-    print(f"{title}: {roofline(table[0], work, traffic, products, limits)}\n")
-    return [measure_of(row) for row in table] + fastest
-
-
-MODES = {"eager": EAGER, "fp32": OWN, "int8": "int8"}
+    print(f"{title}: {roofline(row, work, traffic, products, limits)}\n")
+    return [measure_of(row)]
 
 
 def roofline(row: Comparison, work: float, traffic: float, products: float, limits: dict[str, float]) -> str:
@@ -210,7 +184,7 @@ def mae(completer: NetworkCompleter, frames: list[DepthFrame]) -> float:
 
 
 def bundled_measures(name: str, repeats: int, limits: dict[str, float]) -> list[Measure]:
-    """The bundled network on whole frames: torch, the automatic backend, int8."""
+    """The bundled network on whole frames: torch, the automatic backend, exports."""
     model, card = load_checkpoint(name)
     spec: ModelSpec = card.model
     frames = streets(4, first=1)
@@ -220,24 +194,20 @@ def bundled_measures(name: str, repeats: int, limits: dict[str, float]) -> list[
 
     ways: dict[str, Callable[..., Tensor] | None] = {OWN: own_kernels(model), "torch, channels last": None}
     if find_spec("onnx") and find_spec("onnxruntime"):
-        ways |= backends(export_onnx(model)) | {"int8": quantised_convolutions(model, spec, streets(2, first=20))}
+        ways |= backends(export_onnx(model))
     completers = {label: completer(way) for label, way in ways.items()}
     one = frames[0]
     calls: dict[str, Callable[[], Any]] = {label: partial(depth_of, run, one) for label, run in completers.items()}
     ours = calls.pop(OWN)
     reference = calls["torch, channels last"]()
-    exact = {label: call for label, call in calls.items() if label != "int8"}
-    row = compare("bundled completer, 375x1242", ours, exact, repeats, nearly_everywhere)
-    table = [row]
-    if "int8" in calls:
-        table.append(compare("bundled completer, 375x1242, int8", calls["int8"], {OWN: ours}, repeats))
-    print(format_table(table))
+    row = compare("bundled completer, 375x1242", ours, calls, repeats, nearly_everywhere)
+    print(format_table([row]))
     difference = 1e3 * np.abs(ours() - reference)
     print(
         f"ours beside torch: mean {difference.mean():.4f} mm, 99.9 % of pixels under "
         f"{np.quantile(difference, 0.999):.3f} mm, at most {difference.max():.1f} mm (another candidate chosen)"
     )
-    errors = {label: mae(completers[label], frames) for label in ("torch, channels last", OWN, "int8") if label in ways}
+    errors = {label: mae(completers[label], frames) for label in ("torch, channels last", OWN)}
     exact_error = errors["torch, channels last"]
     costs = ", ".join(
         f"{label} {error:.1f} mm ({100 * (error / exact_error - 1):+.2f} %)" for label, error in errors.items()
@@ -251,7 +221,7 @@ def bundled_measures(name: str, repeats: int, limits: dict[str, float]) -> list[
         f"{name}: {work:.1f} GFLOP, {direct:.0f} ms at the rate of the matrix product; Winograd's convolutions leave "
         f"{products:.1f} GFLOP of products, {least:.0f} ms\n"
     )
-    return [measure_of(each) for each in table]
+    return [measure_of(row)]
 
 
 def coefficient_measures(name: str, repeats: int) -> list[Measure]:

@@ -1,7 +1,7 @@
 """A TWISE whose outputs are depths of streets, within seconds: random features, heads fitted by least squares.
 
-No weights of TWISE-64 are shipped and training takes hours. Differences between backends and the cost of int8 mean
-something only on outputs in metres, so the last layer of each stage, which is linear, is solved for the true depth.
+No weights of TWISE-64 are shipped and training takes hours. Differences between backends mean something only
+on outputs in metres, so the last layer of each stage, which is linear, is solved for the true depth.
 """
 
 from __future__ import annotations

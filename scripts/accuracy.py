@@ -48,7 +48,7 @@ def table(real: dict[str, Any]) -> list[str]:
     frames = f"{real['frames']} real KITTI frames"
     rows = ["| measured | on | bundled networks | for comparison |", "|---|---|---|---|"]
     for count in (32, 16):
-        ours, linear = depth_row(real, network, count), depth_row(real, "linear_inverse", count)
+        ours, linear = depth_row(real, network, count), depth_row(real, "classical", count)
         if ours and linear:
             rows.append(
                 f"| depth from {count} of 64 LiDAR rows, mean error | {frames}, the other rows "

@@ -11,20 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from completion.infer import Completer, load_completer
+from completion.models.classical import ClassicalCompleter
 from detection.infer import load_detector
 from detection.kitti_format import KittiObject
 from detection.results import result_objects
 from detection.types import PointFrame
 from pipeline.benchmark.car_recall import CarReport, car_recall
 from pipeline.benchmark.held_out_rings import BEAM_STRIDES, hold_out, score
-from pipeline.benchmark.peers import PEERS
 from pipeline.data import Dataset, Frame
 from pipeline.pointcloud.presets import PRESETS
 from pipeline.training.thinned_clouds import thinned_cloud
 
 Progress = Callable[[str], None]
 IOUS = (0.5, 0.7)
-WITHOUT_WEIGHTS = (*PEERS, "classical")
+WITHOUT_WEIGHTS = ("nearest", "classical")
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def completion_scores(
 ) -> list[dict[str, Any]]:
     """Mean scores over frames, one entry per method and number of rows; see `held_out_rings.score` for the keys.
 
-    names  peers ("nearest", "linear_inverse"), "classical", or weights as `load_completer` takes them
+    names  "nearest", "classical" (linear in inverse depth), or weights as `load_completer` takes them
     """
     methods = [(name, _method(name)) for name in names]
     if not methods:
@@ -66,10 +66,7 @@ def completion_scores(
 
 
 def _method(name: str) -> Callable[[NDArray[np.float32], NDArray[np.uint8]], NDArray[np.float32]]:
-    if name in PEERS:
-        peer = PEERS[name]
-        return lambda sparse, image: peer(sparse)
-    completer: Completer = load_completer(name, backend="auto")
+    completer: Completer = ClassicalCompleter("nearest") if name == "nearest" else load_completer(name, backend="auto")
     return lambda sparse, image: completer.complete(sparse, image).depth
 
 

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--data", required=True, metavar="DIR", help="KITTI object folder (training/velodyne, image_2, calib, label_2)")
     add("--frames", metavar="FILE|a:b|ids", help="split file, positions, or ids separated by commas")
     add("--rows", default="32,16,8", metavar="N,N", help="LiDAR rows given to completion (default: 32,16,8)")
-    add("--completers", metavar="NAME,NAME", help="methods (default: peers, classical, all bundled); '' for none")
+    add("--completers", metavar="NAME,NAME", help="methods (default: nearest, classical, all bundled); '' for none")
     add("--detectors", metavar="NAME,NAME", help="detectors (default: all bundled); '' for none")
     add(
         "--masks",
