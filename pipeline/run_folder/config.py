@@ -135,8 +135,8 @@ class Config(Section):
 def load_config(source: str | Path | None, overrides: Iterable[str] = ()) -> Config:
     """The configuration of a file with `key.sub=value` overrides applied.
 
-    source  a YAML file; None for the built-in demo. `configs/NAME.yaml` and `NAME` find the built-in file of that name
-            when there is no such file, so that an installed package has them without a checkout
+    source  a YAML file; None for the built-in demo. `configs/NAME.yaml` and `NAME` (also `weights/NAME`, ...) find the
+            built-in file of that name when there is no such file: an installed package has them without a checkout
     Raises UsageError naming the unknown key (with the nearest known one) or the value that does not fit.
     """
     path = config_path(source)
@@ -161,10 +161,12 @@ def config_path(source: str | Path | None) -> Path:
     path = Path(source)
     if path.is_file():
         return path
-    built_in = built_in_folder() / f"{path.stem}.yaml"
-    if str(path) in (path.stem, f"configs/{path.stem}.yaml") and built_in.is_file():
+    folder = built_in_folder()
+    below = path.relative_to("configs") if path.is_relative_to("configs") else path
+    built_in = folder / (below if below.suffix == ".yaml" else f"{below}.yaml")
+    if not path.is_absolute() and ".." not in below.parts and built_in.is_file():
         return built_in
-    names = ", ".join(sorted(file.stem for file in built_in_folder().glob("*.yaml")))
+    names = ", ".join(sorted(str(file.relative_to(folder)).removesuffix(".yaml") for file in folder.rglob("*.yaml")))
     raise UsageError(f"no such configuration file: {path} (built in: {names})")
 
 

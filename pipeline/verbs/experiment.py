@@ -65,8 +65,9 @@ def read_order(args: argparse.Namespace) -> Order:
     from pipeline.experiments.catalogue import find
     from pipeline.experiments.config import read_config
     from pipeline.experiments.plan import Order
+    from pipeline.run_folder.config import config_path
 
-    config = read_config(Path(args.config)) if args.config else None
+    config = read_config(config_path(args.config)) if args.config else None
     wanted = [("table", number) for number in args.table] + [("figure", number) for number in args.figure]
     if not wanted and config is not None:
         wanted = config.wanted
