@@ -18,6 +18,7 @@ from pipeline.data import Dataset
 from pipeline.run_folder.config import Config, dump_config, load_config
 from pipeline.run_folder.frames import data_root, has_points, open_frames
 from pipeline.run_folder.preset import augment_settings
+from pipeline.run_folder.resolved import resolved_config, synth_settings
 from pipeline.runner.batch import Batch, StageSummary, open_batch, shard_of
 from pipeline.runner.failures import update_failures
 from pipeline.runner.jobs import Outcome, Task
@@ -56,12 +57,16 @@ def carry_out(request: Request, record: dict[str, Any] | None = None) -> int:
     """
     record = {} if record is None else record
     out = Path(request.out) if request.out else default_out(request.config)
-    config = load_config(config_source(request, out), request.overrides)
+    config = resolved_config(load_config(config_source(request, out), request.overrides))
     run = RunFolder(out)
     stage = request.stage or "report"
     check_request(request, stage)
+    if stage == "train":
+        from pipeline.training.settings import with_training_settings
+
+        config = with_training_settings(config)
     if "augment" in frame_stages_for(stage, config):
-        augment_settings(config)  # a misspelt preset is refused before anything is written or promised
+        augment_settings(config)  # a preset without its masks is refused before anything is written or promised
     record |= {"run": str(run.root), "stage": stage}
     if request.dry_run:
         record["estimates"] = dry_run(config, run, stage, request.shard)
@@ -151,8 +156,6 @@ def dry_run(config: Config, run: RunFolder, stage: str, shard: tuple[int, int] |
 
     workers = config.run.workers or available_cores()
     if config.data.name == "synthetic" and not data_root(config, run).is_dir():
-        from pipeline.synthetic import synth_settings
-
         frames = synth_settings(config).frames
         estimates = [estimate(name, frames, workers, None) for name in frame_stages_for(stage, config)]
     elif run.root.is_dir():

@@ -5,28 +5,17 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from auglidar_base.atomic import write_text
 from pipeline.base.errors import UsageError
 from pipeline.base.progress import progress
-from pipeline.base.settings import plain, with_changes
+from pipeline.base.settings import plain
 from pipeline.run_folder.config import Config
+from pipeline.run_folder.resolved import synth_settings
 from pipeline.runner.keys import code_version
 from pipeline.runner.processes import available_cores
 
-if TYPE_CHECKING:
-    from pipeline.simulation.synth import SynthSettings
-
 MARKER = "synthetic.json"
-
-
-def synth_settings(config: Config) -> SynthSettings:
-    """Settings of the synthetic world; the run's seed unless the section has its own."""
-    from pipeline.simulation.synth import SynthSettings
-
-    changes = {"seed": config.seed, **config.synth.library}
-    return with_changes(SynthSettings(), changes, "synth")
 
 
 def make_synthetic_data(config: Config, root: Path) -> bool:

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from pipeline.base.errors import UsageError
 from pipeline.base.settings import nearest_name
+from pipeline.base.yaml_files import read_yaml
 from pipeline.experiments.runs import BUDGET_NAMES, KINDS
 
 
@@ -30,14 +29,7 @@ def read_config(path: Path) -> ExperimentConfig:
     Keys: table and figure (a number or a list of them, as text), budget, seeds, and a section per kind of run whose
     keys replace those of its budget.
     """
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(tree, dict):
-        raise UsageError(f"{path}: expected keys with values, got {type(tree).__name__}")
+    tree = read_yaml(path)
     known = ("table", "figure", "budget", "seeds", *KINDS)
     for key in tree:
         if key not in known:

@@ -71,6 +71,11 @@ class AugmentSettings:
         return masked or any(name in SEMANTIC_COLUMNS for name in self.columns)
 
     @property
+    def leaves_lidar_as_it_is(self) -> bool:
+        """True when nothing is completed, masked, added or thinned: what the camera sees of the raw LiDAR comes out."""
+        return not (self.completed or self.semantic_lidar or self.columns or self.max_points)
+
+    @property
     def needs_surfaces(self) -> bool:
         """True when the completed depth must have foreground, background and sigma."""
         return self.completed and (self.sigma is not None or any(name in SURFACE_COLUMNS for name in self.columns))

@@ -16,7 +16,7 @@ from typing import Any
 
 from pipeline.pretrained import cards
 from pipeline.run_folder.config import Config, load_config
-from pipeline.synthetic import synth_settings
+from pipeline.run_folder.resolved import synth_settings
 
 
 def main(argv: Sequence[str] | None = None) -> int:

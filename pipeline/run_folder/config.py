@@ -15,8 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.base.errors import UsageError
 from pipeline.base.settings import nearest_name
-
-MAX_CONFIG_BYTES = 1_000_000
+from pipeline.base.yaml_files import parse_yaml, read_yaml
 
 
 class Section(BaseModel):
@@ -137,11 +136,16 @@ def load_config(source: str | Path | None, overrides: Iterable[str] = ()) -> Con
 
     source  a YAML file; None for the built-in demo. `configs/NAME.yaml` and `NAME` (also `weights/NAME`, ...) find the
             built-in file of that name when there is no such file: an installed package has them without a checkout
+    Overriding the preset or network of a run's own config.yaml takes its numbers with it.
     Raises UsageError naming the unknown key (with the nearest known one) or the value that does not fit.
     """
     path = config_path(source)
-    tree = _read_yaml(path)
-    for text in overrides:
+    tree = read_yaml(path)
+    texts = tuple(overrides)
+    if tree.get("made_with"):
+        for text in texts:
+            _give_way(tree, text)
+    for text in texts:
         _override(tree, text)
     return parse_config(tree, str(path))
 
@@ -177,20 +181,19 @@ def built_in_folder() -> Path:
     return installed if installed.is_dir() else package.parent / "configs"
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        if path.stat().st_size > MAX_CONFIG_BYTES:
-            raise UsageError(f"{path}: expected a configuration file, got {path.stat().st_size / 1e6:.1f} MB")
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise UsageError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
-    if tree is None:
-        return {}
-    if not isinstance(tree, dict):
-        raise UsageError(f"{path}: expected 'section:' lines, got {type(tree).__name__}")
-    return tree
+def _give_way(tree: dict[str, Any], text: str) -> None:
+    """Removes from a run's own configuration, where every field is listed, those of a choice that `text` replaces."""
+    name, _, value = text.partition("=")
+    section, _, key = name.strip().partition(".")
+    given = tree.get(section)
+    if not isinstance(given, dict) or given.get(key) == value.strip():
+        return
+    if name.strip() == "augment.preset":
+        tree[section] = {field: given[field] for field in given if field in AugmentConfig.model_fields}
+    elif name.strip() == "train.network":
+        tree[section] = {field: given[field] for field in given if field in TrainConfig.model_fields}
+    elif name.strip() == "train.model.architecture":
+        tree[section] = {field: given[field] for field in given if field not in ("model", "loss")}
 
 
 def _override(tree: dict[str, Any], text: str) -> None:
@@ -206,10 +209,7 @@ def _override(tree: dict[str, Any], text: str) -> None:
         if not isinstance(inner, dict):
             raise UsageError(f"--set {text}: {key} is a value, not a section")
         tree = inner
-    try:
-        tree[keys[-1]] = yaml.safe_load(value)
-    except yaml.YAMLError:
-        raise UsageError(f"--set {text}: {value!r} is not valid YAML") from None
+    tree[keys[-1]] = parse_yaml(value, f"--set {text}")
 
 
 def _explain(error: ValidationError) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.base.errors import DataError, UsageError
 from pipeline.base.paths import RunFolder
 from pipeline.base.progress import duration
-from pipeline.base.settings import plain, with_changes
+from pipeline.base.settings import plain
 from pipeline.base.versions import made_with
 from pipeline.data import Dataset, Frame
 from pipeline.run_folder.config import Config
@@ -19,6 +19,7 @@ from pipeline.run_folder.frame_outputs import FrameOutputs
 from pipeline.run_folder.frames import open_frames
 from pipeline.stages.clouds import cloud_of
 from pipeline.training.beam_subsampling import RandomBeamSubsampling
+from pipeline.training.settings import completion_settings, detection_settings, segmentation_settings
 
 if TYPE_CHECKING:
     from completion.samples import TrainingSample
@@ -116,18 +117,11 @@ def train_stage(config: Config, run: RunFolder) -> Path:
 
 def train_completion(config: Config, dataset: Dataset, out: Path) -> Path:
     """`completion.train` on frames with true depth; the run's seed unless the section has its own."""
-    from completion.models import default_spec
-    from completion.train import TrainSettings, train
-    from completion.training_loss import LossSettings, default_kind
+    from completion.train import train
 
     if not dataset[0].has("target_depth"):
         raise UsageError(f"{dataset.root}: frame {dataset.ids[0]} has no true depth to train completion on")
-    changes = config.train.library
-    # Another architecture brings its own input scaling, which single keys may still change.
-    architecture = str(changes.get("model", {}).get("architecture", "twise"))
-    spec = default_spec(architecture)
-    base = TrainSettings(spec, LossSettings(default_kind(spec)), seed=config.seed)
-    settings = with_changes(base, changes, "train")
+    settings = completion_settings(config)
     held_back = min(settings.validation_frames, len(dataset) // 10) if settings.validate_every else 0
     count = len(dataset) - held_back
     samples = DepthSamples(
@@ -152,19 +146,18 @@ def _validation_frame(frame: Frame, config: Config) -> DepthFrame:
 
 def train_detection(config: Config, samples: LabelledFrames, out: Path) -> Path:
     """`detection.train` on labelled clouds."""
-    from detection.train import TrainSettings, train
+    from detection.train import train
 
-    settings = with_changes(TrainSettings(seed=config.seed), config.train.library, "train")
-    return train(settings, samples, out, config.detection.device, print_progress)
+    return train(detection_settings(config), samples, out, config.detection.device, print_progress)
 
 
 def train_segmentation(config: Config, dataset: Dataset, out: Path) -> Path:
     """`pipeline.semantics.training.train_segmenter` on frames with class maps."""
-    from pipeline.semantics.training import SegmentationSettings, train_segmenter
+    from pipeline.semantics.training import train_segmenter
 
     if not dataset[0].has("semantics"):
         raise UsageError(f"{dataset.root}: frame {dataset.ids[0]} has no class map to train segmentation on")
-    settings = with_changes(SegmentationSettings(seed=config.seed), config.train.library, "train")
+    settings = segmentation_settings(config)
     out.mkdir(parents=True, exist_ok=True)
     samples: Any = MaskSamples(dataset)
     return train_segmenter(samples, out / "model", settings, print_progress)

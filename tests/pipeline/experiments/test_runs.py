@@ -140,7 +140,7 @@ def test_a_damaged_result_is_named(tmp_path: Path) -> None:
         ("table: 4.5\n", "put the number in quotes"),
         ('table: "4.5"\nseed: 3\n', "unknown key 'seed'; did you mean 'seeds'"),
         ('table: "4.5"\nbudget: tiny\n', "budget: known: smoke, small, paper, got 'tiny'"),
-        ("- 4.5\n", "expected keys with values, got list"),
+        ("- 4.5\n", "expected 'section:' lines, got list"),
     ],
 )
 def test_a_wrong_configuration_is_named(tmp_path: Path, text: str, message: str) -> None:
