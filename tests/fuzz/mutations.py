@@ -65,3 +65,16 @@ def png_files(draw: st.DrawFn) -> bytes:
     extra = chunk(draw(st.sampled_from((b"PLTE", b"tRNS", b"gAMA", b"iCCP", b"eXIf"))), draw(st.binary(max_size=40)))
     parts = [chunk(b"IHDR", header), extra if draw(st.booleans()) else b"", chunk(b"IDAT", pixels), chunk(b"IEND", b"")]
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+_PIECES = [bytes([code]) for code in b".0()tl]}d\x85\x86\x87aesu2b\x81R1N\x88\x89\x8f\x90\x91\x93\x94IJKMUVXcGh"]
+_PIECES += [b"cnumpy\ndtype\n", b"cnumpy\nndarray\n", b"cnumpy.core.multiarray\n_reconstruct\n"]
+_PIECES += [b"cnumpy.core.multiarray\nscalar\n", b"cnumpy.core.numeric\n_frombuffer\n", b"c_codecs\nencode\n"]
+_PIECES += [b"(U\x02f8K\x00K\x01tR", b"(K\x03U\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb", b"(K\x00tU\x01b\x87R"]
+_PIECES += [b"q\x00", b"q\x01", b"h\x00", b"h\x01", b"K\x01", b"K\x02\x85", b"K\x3f", b"J\x00\x00\x00\x80"]
+_PIECES += [b"C\x08AAAAAAAA", b"U\x01C", b"U\x02O8", b"U\x02S8", b"U\x02U2"]
+
+
+def opcodes() -> st.SearchStrategy[bytes]:
+    """Pickles put together from opcodes and from pieces of arrays, in any order."""
+    return st.lists(st.sampled_from(_PIECES), max_size=40).map(lambda pieces: b"".join(pieces) + b".")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -14,7 +15,8 @@ import numpy as np
 from hypothesis import strategies as st
 
 from pipeline.base.errors import DataError, UsageError
-from tests.fuzz.mutations import mutated, png_files
+from tests.fuzz.child import ReaderProcess, read_infos
+from tests.fuzz.mutations import mutated, opcodes, png_files
 
 
 @dataclass(frozen=True)
@@ -201,6 +203,22 @@ def _read_safetensors(path: Path) -> object:
     return load_tensors(path)
 
 
+@cache
+def _pickle_samples() -> tuple[bytes, ...]:
+    """Infos and results in every protocol, and arrays that lie."""
+    from tests.auglidar_base.forged_pickles import FORGED, forged
+
+    boxes = {"name": np.array(["Car", "Van"]), "bbox": np.ones((2, 4), np.float32), "score": np.float32([0.5, 1])}
+    frame = {"frame_id": "000001", **boxes, "extra": [np.zeros((0, 7)), np.str_("x"), np.array(["a", None], object)]}
+    good = tuple(pickle.dumps([frame, {**frame, "n": 3}], protocol=protocol) for protocol in range(6))
+    return good + tuple(forged(name) for name in FORGED)
+
+
+@cache
+def _pickle_reader() -> ReaderProcess:
+    return ReaderProcess(read_infos)
+
+
 def _changed(samples: Callable[[], tuple[bytes, ...]]) -> Callable[[], st.SearchStrategy[bytes]]:
     return lambda: mutated(samples())
 
@@ -240,5 +258,8 @@ TARGETS: dict[str, Target] = {
     "config": Target(_changed(_config_samples), _read_config, UsageError, ".yaml"),
     "ledger": Target(_changed(_ledger_samples), _read_ledger, UsageError, ".sqlite"),
     "checkpoint": Target(_card_and_weights, _read_checkpoint, ValueError, ".both"),
+    "pickle": Target(
+        lambda: mutated(_pickle_samples()) | opcodes(), lambda path: _pickle_reader().read(path), DataError, ".pkl"
+    ),
     "safetensors": Target(_changed(_weights_samples), _read_safetensors, ValueError, ".safetensors"),
 }
