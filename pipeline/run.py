@@ -118,8 +118,7 @@ def stages_to_run(stage: str, config: Config, dataset: Dataset) -> list[str]:
     """The frame stages of a request, after a look at their settings and weights: refused now rather than per frame."""
     stages = frame_stages_for(stage, config, has_points(dataset))
     for name in stages:
-        FRAME_STAGES[name].settings(config)
-        FRAME_STAGES[name].weights(config)
+        FRAME_STAGES[name].of(config).weights()
     return stages
 
 
@@ -152,12 +151,12 @@ def make_data(config: Config, run: RunFolder, stage: str, shard: tuple[int, int]
 
 def dry_run(config: Config, run: RunFolder, stage: str, shard: tuple[int, int] | None) -> list[dict[str, Any]]:
     """Prints what would be done, and gives it; writes nothing but the ledger of a run that exists."""
-    from pipeline.runner.estimate import estimate, estimate_batch
+    from pipeline.runner.estimate import estimate_batch, unmeasured
 
     workers = config.run.workers or available_cores()
     if config.data.name == "synthetic" and not data_root(config, run).is_dir():
         frames = synth_settings(config).frames
-        estimates = [estimate(name, frames, workers, None) for name in frame_stages_for(stage, config)]
+        estimates = unmeasured(config, frame_stages_for(stage, config), frames, workers)
     elif run.root.is_dir():
         batch = open_batch(config, run, shard, StopRequest())
         estimates = estimate_batch(batch, stages_to_run(stage, config, batch.dataset), workers)
@@ -165,7 +164,7 @@ def dry_run(config: Config, run: RunFolder, stage: str, shard: tuple[int, int] |
     else:
         dataset = open_frames(config, run)
         frames = len(shard_of(dataset.ids, shard))
-        estimates = [estimate(name, frames, workers, None) for name in stages_to_run(stage, config, dataset)]
+        estimates = unmeasured(config, stages_to_run(stage, config, dataset), frames, workers)
     print_dry_run(estimates, run, config)
     return [asdict(item) for item in estimates]
 

@@ -27,6 +27,11 @@ class RunFolder:
 
     root: Path
 
+    def output(self, name: str, frame_id: str) -> Path:
+        """A file of a frame by the name of its method: depth, twin, cloud, cloud_columns, counts, detections."""
+        path: Path = getattr(self, name)(frame_id)
+        return path
+
     def depth(self, frame_id: str) -> Path:
         """Completed depth: uint16 PNG, metres x 256."""
         return self.root / "depth" / f"{safe_id(frame_id)}.png"

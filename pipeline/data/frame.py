@@ -61,6 +61,14 @@ class Frame:
         arguments = (*loader.args, *loader.keywords.values())
         return tuple(argument for argument in arguments if isinstance(argument, Path))
 
+    def sources(self, part: str) -> tuple[str, ...]:
+        """The parts that `part` is read from: itself when it is stored, else those it is derived from."""
+        if part == "image_size" and not self.has(part):
+            return ("image",)
+        if part == "sparse_depth" and not self.has(part):
+            return ("points", "calibration", *self.sources("image_size"))
+        return (part,)
+
     def _load(self, part: str) -> Any:
         if part not in self.loaders:
             have = ", ".join(name for name in PARTS if name in self.loaders) or "nothing"

@@ -145,7 +145,7 @@ def make_input(
     """
     from completion.types import CompletedDepth
     from pipeline.pointcloud.augment import augment_frame
-    from pipeline.stages.clouds import with_sigma
+    from pipeline.stages.completed import with_sigma
 
     settings = recipe.settings
     if depth is None:

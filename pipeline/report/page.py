@@ -124,7 +124,7 @@ def settings_of(config: Config) -> list[tuple[str, str]]:
 def score_threshold(config: Config) -> float:
     """The score from which the detector's card takes a box to be meant; -inf where there is no card to say so."""
     try:
-        card = detection_weights(config)[-1]
+        card = detection_weights(detector_name(config))[-1]
     except UsageError:
         return -math.inf
     least = _read_json(card).get("score_threshold")

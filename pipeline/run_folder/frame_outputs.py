@@ -41,16 +41,25 @@ class FrameOutputs:
     id: str
     written: dict[str, Written] = field(default_factory=dict)
 
-    def _write(self, path: Path, data: bytes) -> None:
+    def to_read(self, name: str) -> Path:
+        """The file to read an output from, by its name in `RunFolder`."""
+        return self.run.output(name, self.id)
+
+    def to_write(self, name: str) -> Path:
+        """The file to write an output to, or to remove."""
+        return self.run.output(name, self.id)
+
+    def _write(self, output: str, data: bytes) -> None:
+        path = self.to_write(output)
         write_bytes(path, data)
         name = path.relative_to(self.run.root).as_posix()
         self.written[name] = Written(len(data), content_hash(data))
 
     def write_completed(self, completed: CompletedDepth) -> None:
         """depth/ID.png, and twin/ID.npz when there are two surfaces (an older one is removed when there are not)."""
-        self._write(self.run.depth(self.id), depth_png_bytes(completed.depth))
+        self._write("depth", depth_png_bytes(completed.depth))
         if completed.foreground is None or completed.background is None or completed.sigma is None:
-            self.run.twin(self.id).unlink(missing_ok=True)
+            self.to_write("twin").unlink(missing_ok=True)
             return
         sigma = np.rint(completed.sigma * 255).astype(np.uint8)
         surfaces: dict[str, NDArray[Any]] = {
@@ -58,12 +67,12 @@ class FrameOutputs:
             "background": encode_depth(completed.background),
             "sigma": sigma,
         }
-        self._write(self.run.twin(self.id), npz_bytes(surfaces))
+        self._write("twin", npz_bytes(surfaces))
 
     def read_completed(self) -> CompletedDepth:
         """Completed depth of an earlier stage, quantised as it lies on disk."""
-        depth = read_depth_png(self.run.depth(self.id))
-        path = self.run.twin(self.id)
+        depth = read_depth_png(self.to_read("depth"))
+        path = self.to_read("twin")
         if not path.is_file():
             return CompletedDepth(depth)
         surfaces = read_npz(path, ("foreground", "background", "sigma"))
@@ -78,19 +87,19 @@ class FrameOutputs:
     def write_cloud(self, cloud: AugmentedCloud) -> None:
         """cloud/ID.bin (N x 5), cloud/ID.json (point counts), cloud/ID.columns.npz when there are further columns."""
         base = np.ascontiguousarray(cloud.points[:, :5], dtype="<f4")
-        self._write(self.run.cloud(self.id), base.tobytes())
+        self._write("cloud", base.tobytes())
         counts = [{"step": step, "in": before, "out": after} for step, before, after in cloud.counts]
         record = {"columns": list(cloud.columns), "points": len(cloud.points), "steps": counts}
-        self._write(self.run.counts(self.id), (json.dumps(record, indent=1) + "\n").encode())
+        self._write("counts", (json.dumps(record, indent=1) + "\n").encode())
         extra = {name: cloud.points[:, 5 + i] for i, name in enumerate(cloud.columns[5:])}
         if extra:
-            self._write(self.run.cloud_columns(self.id), npz_bytes(extra))
+            self._write("cloud_columns", npz_bytes(extra))
         else:
-            self.run.cloud_columns(self.id).unlink(missing_ok=True)
+            self.to_write("cloud_columns").unlink(missing_ok=True)
 
     def read_cloud(self) -> NDArray[np.float32]:
         """(N, 5 + C) float32: x y z intensity source and the further columns, LiDAR frame."""
-        path = self.run.cloud(self.id)
+        path = self.to_read("cloud")
         data = read_run_file(path)
         if len(data) % 20:
             raise DataError(path, "float32 rows of x y z intensity source (20 bytes each)", f"{len(data)} bytes")
@@ -98,12 +107,12 @@ class FrameOutputs:
         columns = self.read_counts()["columns"][5:]
         if not columns:
             return points
-        extra = read_npz(self.run.cloud_columns(self.id), tuple(columns))
+        extra = read_npz(self.to_read("cloud_columns"), tuple(columns))
         return np.column_stack([points, *(extra[name] for name in columns)]).astype(np.float32)
 
     def read_counts(self) -> dict[str, Any]:
         """{"columns": [...], "points": N, "steps": [{"step", "in", "out"}, ...]} of the augmentation."""
-        path = self.run.counts(self.id)
+        path = self.to_read("counts")
         try:
             record: dict[str, Any] = json.loads(read_run_file(path))
         except ValueError:
@@ -115,17 +124,17 @@ class FrameOutputs:
 
         Report and exports would take it for what the detector saw; a cloud without completed points stays.
         """
-        if self.run.cloud(self.id).is_file() and self.read_cloud()[:, 4].any():
-            for path in (self.run.cloud(self.id), self.run.counts(self.id), self.run.cloud_columns(self.id)):
-                path.unlink(missing_ok=True)
+        if self.to_read("cloud").is_file() and self.read_cloud()[:, 4].any():
+            for name in ("cloud", "counts", "cloud_columns"):
+                self.to_write(name).unlink(missing_ok=True)
 
     def write_detections(self, objects: list[KittiObject]) -> None:
         """detections/ID.txt, empty when nothing is found."""
-        self._write(self.run.detections(self.id), "".join(format_line(item) + "\n" for item in objects).encode())
+        self._write("detections", "".join(format_line(item) + "\n" for item in objects).encode())
 
     def read_detections(self) -> list[KittiObject]:
         """The result lines of detections/ID.txt."""
-        return read_labels(self.run.detections(self.id), scored=True)
+        return read_labels(self.to_read("detections"), scored=True)
 
 
 _REDO = "remove it and run the stage again"

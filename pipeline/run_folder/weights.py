@@ -20,15 +20,14 @@ def bundled_names(room: str) -> list[str]:
     return sorted(path.stem for path in bundled_folder(room).glob("*.safetensors"))
 
 
-def completion_weights(config: Config) -> tuple[Path, ...]:
-    """Weights and card of the completion network; nothing for the classical method."""
-    name = config.completion.model
+def completion_weights(name: str) -> tuple[Path, ...]:
+    """Weights and card of a completion network; nothing for the classical method."""
     return () if name == "classical" else _files("completion", name, "completion.model", also="classical")
 
 
-def detection_weights(config: Config) -> tuple[Path, ...]:
-    """Weights and card of the detector."""
-    return _files("detection", detector_name(config), "detection.model")
+def detection_weights(name: str) -> tuple[Path, ...]:
+    """Weights and card of a detector, see `detector_name`."""
+    return _files("detection", name, "detection.model")
 
 
 def detector_name(config: Config) -> str:
@@ -50,9 +49,10 @@ def detector_name(config: Config) -> str:
 
 
 def mask_weights(source: str) -> tuple[Path, ...]:
-    """Files of the segmentation model that `augment.semantics` names: network[:WEIGHTS], onnx:FILE, hf:FOLDER."""
+    """Files of the segmentation model that `augment.semantics` names: network or soft[:WEIGHTS], onnx:FILE,
+    hf:FOLDER."""
     kind, _, place = source.partition(":")
-    if kind == "network":
+    if kind in ("network", "soft"):
         return _files("pipeline/semantics", place or "street-small", "augment.semantics")
     if kind == "onnx":
         return (Path(place),)

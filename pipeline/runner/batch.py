@@ -22,6 +22,7 @@ from pipeline.runner.processes import LocalEngine, WorkerFactory, available_core
 from pipeline.runner.signals import StopRequest
 from pipeline.runner.worker import FrameWorker
 from pipeline.stages.order import FRAME_STAGES
+from pipeline.stages.stage import FrameStage
 
 
 class Engine(Protocol):
@@ -65,6 +66,13 @@ class Batch:
     engine: Engine
     budget: DiskBudget
     failed: set[str] = field(default_factory=set)
+    _stages: dict[str, FrameStage] = field(default_factory=dict, repr=False)
+
+    def declared(self, stage: str) -> FrameStage:
+        """The stage with the settings of this run."""
+        if stage not in self._stages:
+            self._stages[stage] = FRAME_STAGES[stage].of(self.config)
+        return self._stages[stage]
 
     def run_stage(self, stage: str) -> StageSummary:
         """Every frame that is not up to date, through the engine and into the ledger."""
@@ -120,17 +128,16 @@ class Batch:
 
     def shared_key(self, stage: str) -> str:
         """The part of the key that all frames of a stage share."""
-        kind = FRAME_STAGES[stage]
-        weights = kind.weights(self.config)
-        return stage_key(kind.settings(self.config), weights, kind.code, self.ledger.file_hash)
+        declared = self.declared(stage)
+        return stage_key(declared.settings(), declared.weights(), declared.code, self.ledger.file_hash)
 
     def key(self, stage: str, frame_id: str, shared: str) -> str:
         """The key of a task; a frame that cannot even be opened gets one that never matches."""
-        kind = FRAME_STAGES[stage]
+        declared = self.declared(stage)
         try:
             frame = self.dataset[frame_id]
-            files = kind.files(self.config, self.run, frame_id)
-            return task_key(shared, frame, kind.parts(self.config, frame), files, self.ledger.file_hash)
+            files = declared.files(self.run, frame_id)
+            return task_key(shared, frame, declared.parts(frame), files, self.ledger.file_hash)
         except (DataError, OSError, UsageError) as error:
             return f"cannot be opened: {error}"
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from pipeline.run_folder.config import Config
 from pipeline.runner.batch import Batch
 from pipeline.runner.processes import available_cores
 from pipeline.stages.order import FRAME_STAGES
-
-_FILES_PER_FRAME = {"complete": 2, "augment": 2, "detect": 1}
+from pipeline.stages.stage import FrameStage
 
 
 @dataclass(frozen=True)
@@ -23,19 +23,23 @@ class StageEstimate:
     measured: bool
 
 
-def estimate(stage: str, frames: int, workers: int, seconds_per_frame: float | None) -> StageEstimate:
+def estimate(name: str, stage: FrameStage, frames: int, workers: int, seconds_per_frame: float | None) -> StageEstimate:
     """The estimate for `frames` frames on `workers` processes (no more than there are cores count)."""
-    kind = FRAME_STAGES[stage]
-    seconds = kind.seconds if seconds_per_frame is None else seconds_per_frame
+    seconds = stage.seconds if seconds_per_frame is None else seconds_per_frame
     parallel = max(1, min(workers, available_cores()))
     return StageEstimate(
-        stage,
+        name,
         frames,
-        frames * _FILES_PER_FRAME[stage],
-        frames * kind.megabytes / 1000,
+        frames * len(stage.writes()),
+        frames * stage.megabytes / 1000,
         frames * seconds / parallel / 60,
         seconds_per_frame is not None,
     )
+
+
+def unmeasured(config: Config, stages: list[str], frames: int, workers: int) -> list[StageEstimate]:
+    """The estimates before anything was done: all frames, default seconds."""
+    return [estimate(name, FRAME_STAGES[name].of(config), frames, workers, None) for name in stages]
 
 
 def estimate_batch(batch: Batch, stages: list[str], workers: int) -> list[StageEstimate]:
@@ -49,5 +53,7 @@ def estimate_batch(batch: Batch, stages: list[str], workers: int) -> list[StageE
                 stage, frame_id, batch.key(stage, frame_id, shared)
             ):
                 changing.add(frame_id)
-        estimates.append(estimate(stage, len(changing), workers, batch.ledger.mean_seconds(stage)))
+        estimates.append(
+            estimate(stage, batch.declared(stage), len(changing), workers, batch.ledger.mean_seconds(stage))
+        )
     return estimates

@@ -2,89 +2,106 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, ClassVar
 
-from pipeline.base.paths import RunFolder
 from pipeline.base.seeds import derive_seed
-from pipeline.base.settings import plain
-from pipeline.data import Frame
+from pipeline.data.frame import Frame
 from pipeline.run_folder.config import Config
 from pipeline.run_folder.frame_outputs import FrameOutputs
 from pipeline.run_folder.preset import augment_settings
 from pipeline.run_folder.weights import mask_weights
-from pipeline.stages.clouds import completed_depth, lidar_of, lidar_parts, with_sigma
-from pipeline.stages.stage import FrameFunction, FrameStage
+from pipeline.stages.clouds import lidar_of, lidar_parts
+from pipeline.stages.completed import completed_depth, with_sigma
+from pipeline.stages.stage import FRAME_CODE, FrameStage, Work
 
 if TYPE_CHECKING:
     from pipeline.pointcloud.presets import AugmentSettings
-    from pipeline.semantics.sources import SemanticsSource
 
 
-def prepare_augment(config: Config) -> FrameFunction:
-    """Completed depth, raw LiDAR and masks in, cloud/ID.bin out."""
-    from pipeline.pointcloud.augment import augment_frame
+@dataclass(frozen=True)
+class AugmentStage(FrameStage):
+    """Completed depth, raw LiDAR and masks in, cloud/ID.bin out.
 
-    settings = augment_settings(config)
-    masks = open_masks(config, settings)
+    cloud       what goes into the cloud
+    masks       source of object masks, as `pipeline.semantics.sources` takes it; None when `cloud` needs none
+    convention  label convention of the masks, when there are some
+    depth_from  folder of depth maps used instead of this run's completed depth
+    seed        of the run
+    """
 
-    def augment(frame: Frame, files: FrameOutputs) -> None:
-        completed = with_sigma(completed_depth(config, frame, files), settings)
-        semantics = masks.semantics(frame) if masks is not None else None
-        seed = derive_seed(config.seed, frame.id, "augment")
-        files.write_cloud(augment_frame(completed, lidar_of(frame), frame.calibration, settings, semantics, seed))
+    cloud: AugmentSettings
+    masks: str | None
+    convention: str | None
+    depth_from: str | None
+    seed: int
 
-    return augment
+    code: ClassVar = (
+        "completion/types.py",
+        "pipeline/pointcloud",
+        "pipeline/semantics",
+        "pipeline/base/seeds.py",
+        *FRAME_CODE,
+    )
+    seconds: ClassVar = 0.3
+    megabytes: ClassVar = 0.8
 
+    @classmethod
+    def of(cls, config: Config) -> AugmentStage:
+        """The augment section; what it says of masks counts only when some are needed."""
+        section, cloud = config.augment, augment_settings(config)
+        masks, convention = (section.semantics, section.convention) if cloud.needs_semantics else (None, None)
+        return cls(cloud, masks, convention, section.depth_from, config.seed)
 
-def open_masks(config: Config, settings: AugmentSettings) -> SemanticsSource | None:
-    """Where the object masks come from, or None when the settings use none."""
-    if not settings.needs_semantics or config.augment.semantics is None:
-        return None
-    from pipeline.semantics.sources import open_semantics
+    @property
+    def mask_kind(self) -> str | None:
+        """The kind of mask source: truth, boxes, files, network, soft, onnx, hf; None without masks."""
+        return None if self.masks is None else self.masks.partition(":")[0]
 
-    return open_semantics(config.augment.semantics, config.augment.convention)
+    def parts(self, frame: Frame) -> tuple[str, ...]:
+        """The LiDAR, and what masks and depth maps from elsewhere are made of or checked against."""
+        size, image = frame.sources("image_size"), ("image",)
+        of_masks = {None: (), "truth": ("semantics",), "boxes": ("labels", *size), "files": size}.get(
+            self.mask_kind, image
+        )
+        return *lidar_parts(frame), *of_masks, *(size if self.depth_from is not None else ())
 
+    def reads(self) -> tuple[str, ...]:
+        """This run's completed depth."""
+        return ("depth", "twin") if self.depth_from is None else ()
 
-def _augment_record(config: Config) -> Any:
-    section = config.augment
-    masks = (section.semantics, section.convention) if augment_settings(config).needs_semantics else None
-    return {"settings": plain(augment_settings(config)), "masks": masks, "seed": config.seed}
+    def user_files(self, frame_id: str) -> tuple[Path, ...]:
+        """Depth and mask of the frame in the user's folders."""
+        files = () if self.depth_from is None else (Path(self.depth_from) / f"{frame_id}.png",)
+        if self.mask_kind != "files":
+            return files
+        folder = Path(str(self.masks).partition(":")[2])
+        return *files, folder / f"{frame_id}.png", folder / "mask.json"
 
+    def weights(self) -> tuple[Path, ...]:
+        """Files of the segmentation model."""
+        return () if self.masks is None else mask_weights(self.masks)
 
-def _augment_parts(config: Config, frame: Frame) -> tuple[str, ...]:
-    parts = (*lidar_parts(frame), "image_size")
-    kind = mask_kind(config)
-    return parts if kind is None else (*parts, *{"truth": ("semantics",), "boxes": ("labels",)}.get(kind, ("image",)))
+    def writes(self) -> tuple[str, ...]:
+        """Points, counts of the steps, and further columns when the cloud has some."""
+        return ("cloud", "counts", "cloud_columns") if self.cloud.columns else ("cloud", "counts")
 
+    def removes(self) -> tuple[str, ...]:
+        """Columns of another preset."""
+        return () if self.cloud.columns else ("cloud_columns",)
 
-def mask_kind(config: Config) -> str | None:
-    """The kind of mask source (truth, boxes, files, network, onnx, hf) when the settings use masks."""
-    used = augment_settings(config).needs_semantics and config.augment.semantics is not None
-    return str(config.augment.semantics).partition(":")[0] if used else None
+    def open(self) -> Work:
+        """Opens the source of masks."""
+        from pipeline.pointcloud.augment import augment_frame
+        from pipeline.semantics.sources import open_semantics
 
+        source = None if self.masks is None else open_semantics(self.masks, self.convention)
 
-def _augment_files(config: Config, run: RunFolder, frame_id: str) -> tuple[Path, ...]:
-    files: tuple[Path, ...] = (run.depth(frame_id), run.twin(frame_id))
-    if config.augment.depth_from is not None:
-        files = (Path(config.augment.depth_from) / f"{frame_id}.png",)
-    if mask_kind(config) == "files":
-        folder = Path(str(config.augment.semantics).partition(":")[2])
-        files += (folder / f"{frame_id}.png", folder / "mask.json")
-    return files
+        def augment(frame: Frame, files: FrameOutputs) -> None:
+            completed = with_sigma(completed_depth(self.depth_from, frame, files), self.cloud)
+            semantics = source.semantics(frame) if source is not None else None
+            seed = derive_seed(self.seed, frame.id, "augment")
+            files.write_cloud(augment_frame(completed, lidar_of(frame), frame.calibration, self.cloud, semantics, seed))
 
-
-def _augment_weights(config: Config) -> tuple[Path, ...]:
-    return () if mask_kind(config) is None else mask_weights(str(config.augment.semantics))
-
-
-AUGMENT = FrameStage(
-    prepare_augment,
-    _augment_record,
-    _augment_parts,
-    _augment_files,
-    _augment_weights,
-    ("pipeline/pointcloud", "pipeline/semantics", "pipeline/geometry", "pipeline/data"),
-    seconds=0.3,
-    megabytes=0.8,
-)
+        return augment

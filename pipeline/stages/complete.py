@@ -2,42 +2,62 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
 from pipeline.base.errors import DataError
-from pipeline.data import Frame
+from pipeline.data.frame import Frame
 from pipeline.run_folder.config import Config
 from pipeline.run_folder.frame_outputs import FrameOutputs
 from pipeline.run_folder.weights import completion_weights
-from pipeline.stages.stage import FrameFunction, FrameStage
+from pipeline.stages.stage import FRAME_CODE, FrameStage, Work
 
 
-def prepare_complete(config: Config) -> FrameFunction:
-    """Sparse depth and image in, depth/ID.png and twin/ID.npz out."""
-    from completion.infer import load_completer
+@dataclass(frozen=True)
+class CompleteStage(FrameStage):
+    """Sparse depth and image in, depth/ID.png and twin/ID.npz out.
 
-    completer = load_completer(config.completion.model, config.completion.device, config.completion.backend)
+    model, device, backend  as `completion.infer.load_completer` takes them
+    """
 
-    def complete(frame: Frame, files: FrameOutputs) -> None:
-        camera = frame.calibration.K if frame.has("calibration") else None
-        if frame.has("points") and not frame.sparse_depth.any():
-            where = next(iter(frame.files("points")), frame.where)
-            raise DataError(where, "points in the image", "no pixel has a value", "does the calibration fit?")
-        files.write_completed(completer.complete(frame.sparse_depth, frame.image, camera))
+    model: str
+    device: str
+    backend: str
 
-    return complete
+    code: ClassVar = ("completion", "auglidar_base/torch_pickle.py", *FRAME_CODE)
+    seconds: ClassVar = 3.0
+    megabytes: ClassVar = 1.2
 
+    @classmethod
+    def of(cls, config: Config) -> CompleteStage:
+        """The completion section."""
+        section = config.completion
+        return cls(section.model, section.device, section.backend)
 
-def _complete_parts(config: Config, frame: Frame) -> tuple[str, ...]:
-    sparse = ("sparse_depth",) if frame.has("sparse_depth") else ("points",)
-    return ("image", "calibration", *sparse)
+    def parts(self, frame: Frame) -> tuple[str, ...]:
+        """Stored sparse depth, or the points it is projected from."""
+        return "image", "calibration", "sparse_depth", *frame.sources("sparse_depth")
 
+    def weights(self) -> tuple[Path, ...]:
+        """Network and card; nothing for the classical method."""
+        return completion_weights(self.model)
 
-COMPLETE = FrameStage(
-    prepare_complete,
-    lambda config: config.completion.model_dump(),
-    _complete_parts,
-    lambda config, run, frame_id: (),
-    completion_weights,
-    ("completion", "pipeline/geometry", "pipeline/data"),
-    seconds=3.0,
-    megabytes=1.2,
-)
+    def writes(self) -> tuple[str, ...]:
+        """The second for networks with two surfaces."""
+        return "depth", "twin"
+
+    def open(self) -> Work:
+        """Loads the completer."""
+        from completion.infer import load_completer
+
+        completer = load_completer(self.model, self.device, self.backend)
+
+        def complete(frame: Frame, files: FrameOutputs) -> None:
+            camera = frame.calibration.K if frame.has("calibration") else None
+            if not frame.has("sparse_depth") and not frame.sparse_depth.any():
+                where = next(iter(frame.files("points")), frame.where)
+                raise DataError(where, "points in the image", "no pixel has a value", "does the calibration fit?")
+            files.write_completed(completer.complete(frame.sparse_depth, frame.image, camera))
+
+        return complete

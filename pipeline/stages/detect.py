@@ -2,55 +2,78 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
-from pipeline.base.paths import RunFolder
-from pipeline.data import Frame
+from pipeline.data.frame import Frame
 from pipeline.run_folder.config import Config
 from pipeline.run_folder.frame_outputs import FrameOutputs
 from pipeline.run_folder.preset import uses_raw_lidar
 from pipeline.run_folder.weights import detection_weights, detector_name
 from pipeline.stages.clouds import cloud_of, lidar_parts
-from pipeline.stages.stage import FrameFunction, FrameStage
+from pipeline.stages.stage import FRAME_CODE, FrameStage, Work
 
 
-def prepare_detect(config: Config) -> FrameFunction:
-    """Augmented cloud (or raw LiDAR with preset L) in, detections/ID.txt out."""
-    from detection.infer import load_detector
-    from detection.results import result_objects
-    from detection.types import PointFrame
+@dataclass(frozen=True)
+class DetectStage(FrameStage):
+    """Augmented cloud (or raw LiDAR with preset L) in, detections/ID.txt out.
 
-    detector = load_detector(detector_name(config), config.detection.device, config.seed)
-    raw = uses_raw_lidar(config)
+    detector   weights by name or file
+    device     as `detection.infer.load_detector` takes it
+    raw_lidar  the sensor's points instead of the augmented cloud
+    seed       of the run
+    """
 
-    def detect(frame: Frame, files: FrameOutputs) -> None:
-        camera = frame.calibration
-        points = cloud_of(config, frame, files)
-        cloud = PointFrame(points, camera.T_cam_velo, camera.P2, frame.image_size, frame.id)
-        files.write_detections(result_objects(detector.detect(cloud), cloud))
-        if raw:
-            files.remove_other_presets_cloud()
+    detector: str
+    device: str
+    raw_lidar: bool
+    seed: int
 
-    return detect
+    code: ClassVar = ("detection", "completion/types.py", "auglidar_base/torch_pickle.py", *FRAME_CODE)
+    seconds: ClassVar = 2.0
+    megabytes: ClassVar = 0.01
 
+    @classmethod
+    def of(cls, config: Config) -> DetectStage:
+        """The detection section, and what the detector sees."""
+        return cls(detector_name(config), config.detection.device, uses_raw_lidar(config), config.seed)
 
-def _detect_parts(config: Config, frame: Frame) -> tuple[str, ...]:
-    return (*lidar_parts(frame), "image_size") if uses_raw_lidar(config) else ("calibration", "image_size")
+    def parts(self, frame: Frame) -> tuple[str, ...]:
+        """The camera, and the LiDAR when the detector takes that."""
+        camera = "calibration", *frame.sources("image_size")
+        return (*lidar_parts(frame), *camera) if self.raw_lidar else camera
 
+    def reads(self) -> tuple[str, ...]:
+        """The augmented cloud."""
+        return () if self.raw_lidar else ("cloud", "counts", "cloud_columns")
 
-def _detect_files(config: Config, run: RunFolder, frame_id: str) -> tuple[Path, ...]:
-    if uses_raw_lidar(config):
-        return ()
-    return run.cloud(frame_id), run.cloud_columns(frame_id), run.counts(frame_id)
+    def weights(self) -> tuple[Path, ...]:
+        """Network and card."""
+        return detection_weights(self.detector)
 
+    def writes(self) -> tuple[str, ...]:
+        """KITTI result lines."""
+        return ("detections",)
 
-DETECT = FrameStage(
-    prepare_detect,
-    lambda config: {**config.detection.model_dump(), "name": detector_name(config), "seed": config.seed},
-    _detect_parts,
-    _detect_files,
-    detection_weights,
-    ("detection", "pipeline/geometry", "pipeline/data"),
-    seconds=2.0,
-    megabytes=0.01,
-)
+    def removes(self) -> tuple[str, ...]:
+        """With raw LiDAR a cloud of another preset: report and exports would take it for what the detector saw."""
+        return ("cloud", "cloud_columns", "counts") if self.raw_lidar else ()
+
+    def open(self) -> Work:
+        """Loads the detector."""
+        from detection.infer import load_detector
+        from detection.results import result_objects
+        from detection.types import PointFrame
+
+        detector = load_detector(self.detector, self.device, self.seed)
+
+        def detect(frame: Frame, files: FrameOutputs) -> None:
+            camera = frame.calibration
+            points = cloud_of(self.raw_lidar, frame, files)
+            cloud = PointFrame(points, camera.T_cam_velo, camera.P2, frame.image_size, frame.id)
+            files.write_detections(result_objects(detector.detect(cloud), cloud))
+            if self.raw_lidar:
+                files.remove_other_presets_cloud()
+
+        return detect

@@ -5,15 +5,15 @@ from __future__ import annotations
 from pipeline.base.errors import UsageError
 from pipeline.run_folder.config import Config
 from pipeline.run_folder.preset import uses_raw_lidar
-from pipeline.stages.augment import AUGMENT
-from pipeline.stages.complete import COMPLETE
-from pipeline.stages.detect import DETECT
+from pipeline.stages.augment import AugmentStage
+from pipeline.stages.complete import CompleteStage
+from pipeline.stages.detect import DetectStage
 from pipeline.stages.stage import FrameStage
 
 # The order of the work; asking for a stage runs what it needs before it.
 STAGES = ("synth", "train", "complete", "augment", "detect", "evaluate", "report")
 
-FRAME_STAGES: dict[str, FrameStage] = {"complete": COMPLETE, "augment": AUGMENT, "detect": DETECT}
+FRAME_STAGES: dict[str, type[FrameStage]] = {"complete": CompleteStage, "augment": AugmentStage, "detect": DetectStage}
 
 
 def frame_stages_for(stage: str, config: Config, has_points: bool = True) -> list[str]:

@@ -17,6 +17,7 @@ from pipeline.data import Dataset, Frame
 from pipeline.run_folder.config import Config
 from pipeline.run_folder.frame_outputs import FrameOutputs
 from pipeline.run_folder.frames import open_frames
+from pipeline.run_folder.preset import uses_raw_lidar
 from pipeline.stages.clouds import cloud_of
 from pipeline.training.beam_subsampling import RandomBeamSubsampling
 from pipeline.training.settings import completion_settings, detection_settings, segmentation_settings
@@ -69,7 +70,7 @@ class CloudSamples:
         from detection.types import PointFrame
 
         frame = self.dataset[index]
-        points = cloud_of(self.config, frame, FrameOutputs(self.run, frame.id))
+        points = cloud_of(uses_raw_lidar(self.config), frame, FrameOutputs(self.run, frame.id))
         camera = frame.calibration
         return PointFrame(points, camera.T_cam_velo, camera.P2, frame.image_size, frame.id), frame.labels
 

@@ -24,7 +24,7 @@ from pipeline.geometry.rings import subsample_rows
 from pipeline.run_folder.config import Config
 from pipeline.run_folder.preset import augment_settings, uses_raw_lidar
 from pipeline.run_folder.weights import completion_weights
-from pipeline.stages.clouds import with_sigma
+from pipeline.stages.completed import with_sigma
 
 if TYPE_CHECKING:
     from completion.infer import Completer
@@ -106,7 +106,7 @@ class ThinnedClouds:
         if uses_raw_lidar(self.config):
             return "L"
         facts = json.dumps([plain(augment_settings(self.config)), self.config.completion.model, self.config.seed])
-        weights = [path.read_bytes() for path in completion_weights(self.config)]
+        weights = [path.read_bytes() for path in completion_weights(self.config.completion.model)]
         return f"{self.config.augment.preset}-{hashlib.sha256(facts.encode() + b''.join(weights)).hexdigest()[:12]}"
 
     def _tools(self) -> tuple[AugmentSettings | None, Completer | None]:
