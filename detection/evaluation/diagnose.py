@@ -7,9 +7,10 @@ from itertools import permutations
 
 import numpy as np
 
+from detection.evaluation.matcher import Matcher
 from detection.evaluation.objects import Array, ObjectTable
 from detection.evaluation.overlaps import overlaps_of
-from detection.evaluation.protocol import Matcher, Target
+from detection.evaluation.protocol import Target
 from detection.evaluation.reading import BROKEN_LINE, FramePair
 
 Change = Callable[[Array], Array]

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from detection.evaluation.difficulty import MAX_OCCLUSION, MAX_TRUNCATION, KittiDifficulty
+from detection.evaluation.matcher import Matcher
 from detection.evaluation.matching import IGNORED, INVISIBLE, VALID, Flags, match_all
 from detection.evaluation.objects import ALPHA, OCCLUDED, SCORE, TRUNCATED, Array, Mask, ObjectTable, Z
 from detection.evaluation.overlaps import Index
-from detection.evaluation.protocol import NEIGHBOURS, Matcher, Target
+from detection.evaluation.protocol import NEIGHBOURS, Target
 
 MATCHED, MISSED, LEFT_OUT, FALSE_POSITIVE = "matched", "missed", "ignored", "false positive"
 
@@ -139,7 +140,7 @@ class _Story:
         if values[TRUNCATED] > MAX_TRUNCATION[self.level]:
             reasons.append(("truncated", f"{values[TRUNCATED]:g} > {MAX_TRUNCATION[self.level]:g}"))
         limit = self.matcher.difficulty.min_height[self.level]
-        if height < limit or (self.matcher.flavor == "python" and height == limit):
+        if height < limit or (self.matcher.protocol.flavor == "python" and height == limit):
             reasons.append(("height under limit", f"{height:.2f} of {limit:g} px"))
         return " and ".join(name for name, _ in reasons), ", ".join(text for _, text in reasons)
 

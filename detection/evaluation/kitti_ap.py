@@ -6,16 +6,17 @@ Explained with figures in docs/evaluation.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypedDict
 
-from detection.evaluation.curves import RECALL_POINTS, Curve, average_precision, curve_of, exact_ap
-from detection.evaluation.difficulty import LEVELS, DifficultyRule, Vkitti2Difficulty, difficulty_named
+from detection.evaluation.curves import Curve, average_precision, curve_of, exact_ap
+from detection.evaluation.difficulty import LEVELS, Vkitti2Difficulty
+from detection.evaluation.matcher import Matcher, levels
 from detection.evaluation.matching import MatchRecords
 from detection.evaluation.objects import OCCLUDED, TRUNCATED, FrameObjects
-from detection.evaluation.protocol import EVERYWHERE, METRICS, Matcher, Range, Target, levels, targets_of
+from detection.evaluation.protocol import EVERYWHERE, EvaluationProtocol, Range, Target
 from detection.evaluation.reading import PathLike, read_pair
 
 ApRow = TypedDict(
@@ -55,18 +56,24 @@ class Report(TypedDict):
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Labels and detections matched for a list of targets; everything else is read off its records.
-
-    recall_points  40 or 11
-    """
+    """Labels and detections matched for a list of targets; everything else is read off its records."""
 
     matcher: Matcher
-    targets: tuple[Target, ...]
-    recall_points: int = 40
 
-    def __post_init__(self) -> None:
-        if self.recall_points not in RECALL_POINTS:
-            raise ValueError(f"recall points: expected 40 or 11, got {self.recall_points}")
+    @property
+    def protocol(self) -> EvaluationProtocol:
+        """What was asked."""
+        return self.matcher.protocol
+
+    @cached_property
+    def targets(self) -> tuple[Target, ...]:
+        """The rows of results, in the order asked for."""
+        return self.protocol.targets
+
+    @property
+    def recall_points(self) -> int:
+        """40 or 11."""
+        return self.protocol.recall
 
     @cached_property
     def records(self) -> dict[Target, tuple[MatchRecords, ...]]:
@@ -119,17 +126,17 @@ class Evaluation:
             "recall": [self._side_row(target, found_share) for target in self.targets if target.metric != "aos"],
             "warnings": [*small_set_warnings(rows), *skipped_summary(problems)],
             "skipped": {kind: sum(1 for found, _ in problems if found == kind) for kind, _ in problems},
-            "protocol": self._protocol(),
+            "protocol": self._choices_made(),
         }
 
-    def _protocol(self) -> dict[str, Any]:
+    def _choices_made(self) -> dict[str, Any]:
         matcher = self.matcher
         labels = matcher.pair.labels
         protocol: dict[str, Any] = {
-            "flavor": matcher.flavor,
+            "flavor": self.protocol.flavor,
             "difficulty": str(matcher.difficulty),
-            "range_rule": matcher.range_rule,
-            "range_axis": matcher.range_axis,
+            "range_rule": self.protocol.range_rule,
+            "range_axis": self.protocol.range_axis,
             "frames": len(matcher.pair.frames),
             "labels": len(labels),
             "detections": len(matcher.pair.detections),
@@ -193,82 +200,38 @@ def small_set_warnings(rows: Sequence[ApRow]) -> list[str]:
 def prepare(
     labels: PathLike | FrameObjects,
     detections: PathLike | FrameObjects,
+    protocol: EvaluationProtocol | None = None,
     *,
-    classes: Sequence[str] = ("Car", "Pedestrian", "Cyclist"),
-    metrics: Sequence[str] = METRICS,
-    recall: int = 40,
-    iou_set: str = "both",
-    ious: Mapping[str, Sequence[float]] | None = None,
-    flavor: str = "cpp",
-    ranges: Sequence[Range] = (EVERYWHERE,),
-    range_rule: str = "clocs",
-    range_axis: str = "z",
-    difficulty: str | DifficultyRule = "kitti",
     frames: Sequence[str] | None = None,
     missing: str = "error",
     lenient: bool = False,
+    **choices: Any,
 ) -> Evaluation:
     """Read both sides and set up the evaluation; the arguments are those of `evaluate`."""
-    targets = targets_of(classes, iou_set, ious or {}, ranges, metrics)
-    rule = difficulty_named(difficulty, flavor) if isinstance(difficulty, str) else difficulty
-    pair = read_pair(labels, detections, frames=frames, missing=missing, lenient=lenient)
-    return Evaluation(Matcher(pair, flavor, range_rule, range_axis, rule), targets, recall)
+    asked = replace(protocol or EvaluationProtocol(), **choices)
+    return Evaluation(Matcher(read_pair(labels, detections, frames=frames, missing=missing, lenient=lenient), asked))
 
 
 def evaluate(
     labels: PathLike | FrameObjects,
     detections: PathLike | FrameObjects,
+    protocol: EvaluationProtocol | None = None,
     *,
-    classes: Sequence[str] = ("Car", "Pedestrian", "Cyclist"),
-    metrics: Sequence[str] = METRICS,
-    recall: int = 40,
-    iou_set: str = "both",
-    ious: Mapping[str, Sequence[float]] | None = None,
-    flavor: str = "cpp",
-    ranges: Sequence[Range] = (EVERYWHERE,),
-    range_rule: str = "clocs",
-    range_axis: str = "z",
-    difficulty: str | DifficultyRule = "kitti",
     frames: Sequence[str] | None = None,
     missing: str = "error",
     lenient: bool = False,
+    **choices: Any,
 ) -> Report:
     """KITTI AP of detections against labels; the same numbers as `run_pipeline --stage evaluate`.
 
     labels      folder of KITTI label files (15 columns), or frame name -> list of KittiObject, or a list of such lists
     detections  folder of KITTI result files (16 columns, the score last), or the same in memory with scores
-    classes     names to evaluate; upper and lower case alike
-    metrics     some of "2d", "aos", "bev", "3d"
-    recall      40 or 11 recall points
-    iou_set     "strict" (Car 0.7, others 0.5), "loose" (bev and 3d: 0.5 and 0.25) or "both"
-    ious        class -> IoUs that replace the sets for that class, as {"Car": [0.3, 0.5, 0.7]}
-    flavor      "cpp": the official devkit; "python": the widely used port (a label exactly 40 or 25 px high is ignored,
-                DontCare is written so and known in the image only, AOS is judged by the first detection)
-    ranges      pairs (lo, hi) in metres, lo <= distance < hi, hi None = no limit; (0, None) = everything
-    range_rule  "clocs": labels outside are ignored, detections outside dropped; "border": a detection outside that
-                overlaps a label inside still counts, and others outside are ignored
-    range_axis  "z": depth along the optical axis; "radius": distance on the ground
-    difficulty  "kitti", "vkitti2" (columns truncated and occluded hold ratios 0..1), "vkitti2:and:bands:ignore" and
-                the like (see Vkitti2Difficulty), or a DifficultyRule
+    protocol    what counts and how; None = the official devkit's, all classes and metrics
     frames      frames to evaluate (a split); None = every labelled frame
     missing     a frame without result file: "error", "skip" (as the official offline tool) or "empty"
     lenient     pass over broken lines, missing files and results of unknown frames; counted in "skipped"
+    choices     fields of `EvaluationProtocol` that replace those of `protocol`: evaluate(a, b, classes=["Car"])
     Raises ValueError (InputError with file and line for bad files).
     """
-    return prepare(
-        labels,
-        detections,
-        classes=classes,
-        metrics=metrics,
-        recall=recall,
-        iou_set=iou_set,
-        ious=ious,
-        flavor=flavor,
-        ranges=ranges,
-        range_rule=range_rule,
-        range_axis=range_axis,
-        difficulty=difficulty,
-        frames=frames,
-        missing=missing,
-        lenient=lenient,
-    ).report()
+    reading: dict[str, Any] = {"frames": frames, "missing": missing, "lenient": lenient}
+    return prepare(labels, detections, protocol, **reading, **choices).report()

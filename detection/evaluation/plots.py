@@ -12,8 +12,9 @@ from detection.evaluation.curves import SAMPLES
 from detection.evaluation.difficulty import LEVELS
 from detection.evaluation.explain import FALSE_POSITIVE, MATCHED, explain
 from detection.evaluation.kitti_ap import Evaluation
+from detection.evaluation.matcher import Matcher
 from detection.evaluation.objects import Array
-from detection.evaluation.protocol import Matcher, Target
+from detection.evaluation.protocol import Target
 from detection.evaluation.tables import METRIC_NAMES, range_text
 
 CURVE_COLUMNS = (

@@ -1,33 +1,21 @@
-"""What is asked for, and the flags every label and detection carries into the matching."""
+"""What is asked of an evaluation: classes, metrics, limits and rules, and the rows of results that follow."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from typing import Literal, get_args
 
-import numpy as np
+from detection.evaluation.difficulty import DifficultyRule, difficulty_named
 
-from detection.evaluation.difficulty import DifficultyRule, KittiDifficulty
-from detection.evaluation.matching import (
-    IGNORED,
-    INVISIBLE,
-    VALID,
-    Flags,
-    MatchCandidates,
-    MatchRecords,
-    match_candidates,
-    record_matches,
-)
-from detection.evaluation.objects import Mask, ObjectTable, X, Y, Z
-from detection.evaluation.overlaps import Overlaps, overlaps_of
-from detection.evaluation.reading import FramePair
+Metric = Literal["2d", "aos", "bev", "3d"]
+IouSet = Literal["strict", "loose", "both"]
+Flavor = Literal["cpp", "python"]
+RangeRule = Literal["clocs", "border"]
+RangeAxis = Literal["z", "radius"]
+RecallPoints = Literal[40, 11]
 
-METRICS = ("2d", "aos", "bev", "3d")
-IOU_SETS = ("strict", "loose", "both")
-FLAVORS = ("cpp", "python")
-RANGE_RULES = ("clocs", "border")
-RANGE_AXES = ("z", "radius")
+METRICS: tuple[Metric, ...] = get_args(Metric)
 KITTI_CLASSES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
 
 # A neighbouring class is ignored: finding it is neither right nor wrong.
@@ -60,182 +48,90 @@ def min_overlap(cls: str, metric: str, iou_set: str) -> float:
     return 0.7 if is_car else 0.5
 
 
-def targets_of(
-    classes: Sequence[str],
-    iou_set: str,
-    ious: Mapping[str, Sequence[float]],
-    ranges: Sequence[Range],
-    metrics: Sequence[str],
-) -> tuple[Target, ...]:
-    """Every row asked for, each once (image rows of the strict and loose set are the same).
-
-    ious  class -> IoUs that replace the sets for that class. Raises ValueError for what cannot be asked.
-    """
-    _check_request(classes, iou_set, ious, ranges, metrics)
-    sets = ("strict", "loose") if iou_set == "both" else (iou_set,)
-    own = {name.lower(): values for name, values in ious.items()}
-    rows = [
-        Target(cls, metric, min_overlap(cls, metric, limit) if isinstance(limit, str) else float(limit), bounds)
-        for bounds in ranges
-        for cls in classes
-        for limit in own.get(cls.lower(), sets)
-        for metric in metrics
-    ]
-    return tuple(dict.fromkeys(rows))
-
-
-def _check_request(
-    classes: Sequence[str],
-    iou_set: str,
-    ious: Mapping[str, Sequence[float]],
-    ranges: Sequence[Range],
-    metrics: Sequence[str],
-) -> None:
-    if isinstance(classes, str) or not classes:
-        raise ValueError(f"classes: expected a list of class names, got {classes!r}")
-    if any(name.lower() == "dontcare" for name in classes):
-        raise ValueError("classes: DontCare marks areas and cannot be evaluated")
-    if iou_set not in IOU_SETS:
-        raise ValueError(f"IoU set: expected one of {', '.join(IOU_SETS)}, got {iou_set!r}")
-    for name, values in ious.items():
-        if name.lower() not in {cls.lower() for cls in classes}:
-            raise ValueError(f"IoU of {name}: that class is not evaluated ({', '.join(classes)} are)")
-        impossible = [value for value in values if not 0 <= value < 1]
-        if impossible:
-            raise ValueError(f"IoU of {name}: expected 0 <= IoU < 1 (a match needs more than it), got {impossible[0]}")
-    for lo, hi in ranges:
-        if hi is not None and not lo < hi:
-            raise ValueError(f"range: expected LO < HI in metres, got {lo} {hi}")
-    wrong = [metric for metric in metrics if metric not in METRICS]
-    if wrong:
-        raise ValueError(f"metric: expected some of {', '.join(METRICS)}, got {wrong[0]!r}")
-
-
-def label_flags(labels: ObjectTable, cls: str, counts: Mask, in_range: Mask) -> Flags:
-    """(G,) flags: 0 the class within the difficulty and range, 1 the class otherwise or its neighbour, -1 others."""
-    flags = np.full(len(labels), INVISIBLE, dtype=np.int8)
-    neighbour = NEIGHBOURS.get(cls.lower())
-    if neighbour is not None:
-        flags[labels.is_type(neighbour)] = IGNORED
-    same = labels.is_type(cls)
-    flags[same] = np.where((counts & in_range)[same], VALID, IGNORED)
-    return flags
-
-
-def detection_flags(detections: ObjectTable, cls: str, min_height: float, flavor: str) -> Flags:
-    """(D,) flags: 1 lower in the image than the difficulty asks, *whatever the class*; 0 the class; -1 others."""
-    height = np.abs(detections.height_2d)
-    if flavor == "cpp":
-        height = np.trunc(height)  # the devkit stores it in an int
-    flags = np.where(detections.is_type(cls), VALID, INVISIBLE).astype(np.int8)
-    flags[height < min_height] = IGNORED
-    return flags
-
-
 @dataclass(frozen=True)
-class Matcher:
-    """Labels and detections with the rules that decide who counts; overlaps are computed once per kind.
+class EvaluationProtocol:
+    """What counts and how: the same choices for `kitti_ap.evaluate`, the command line and the YAML of a run.
 
-    flavor      "cpp" (official devkit) or "python" (the widely used port)
-    range_rule  "clocs": detections outside a range are dropped, labels outside ignored;
-                "border": a detection outside that overlaps a label inside still counts, others outside are ignored
-    range_axis  "z" (depth along the optical axis) or "radius" (distance on the ground)
+    classes     names to evaluate; upper and lower case alike
+    metrics     some of "2d", "aos", "bev", "3d"
+    recall      40 or 11 recall points
+    iou_set     limits of BEV and 3D: "strict" (Car 0.7, others 0.5), "loose" (0.5 and 0.25) or "both"
+    ious        class -> IoUs that replace the sets for that class, as {"Car": [0.3, 0.5, 0.7]}
+    flavor      "cpp": the official devkit; "python": the widely used port (a label exactly 40 or 25 px high is ignored,
+                DontCare is written so and known in the image only, AOS is judged by the first detection)
+    ranges      pairs (lo, hi) in metres, lo <= distance < hi, hi None = no limit; (0, None) = everything
+    range_rule  "clocs": labels outside are ignored, detections outside dropped; "border": a detection outside that
+                overlaps a label inside still counts, and others outside are ignored
+    range_axis  "z": depth along the optical axis; "radius": distance on the ground
+    difficulty  "kitti", "vkitti2" (columns truncated and occluded hold ratios 0..1), "vkitti2:and:bands:ignore" and
+                the like (see Vkitti2Difficulty), or a DifficultyRule
+
+    Sequences of any kind are taken and kept as tuples. Raises ValueError for what cannot be asked.
     """
 
-    pair: FramePair
-    flavor: str = "cpp"
-    range_rule: str = "clocs"
-    range_axis: str = "z"
-    difficulty: DifficultyRule = field(default_factory=KittiDifficulty)
+    classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist")
+    metrics: tuple[Metric, ...] = METRICS
+    recall: RecallPoints = 40
+    iou_set: IouSet = "both"
+    ious: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    flavor: Flavor = "cpp"
+    ranges: tuple[Range, ...] = (EVERYWHERE,)
+    range_rule: RangeRule = "clocs"
+    range_axis: RangeAxis = "z"
+    difficulty: str | DifficultyRule = "kitti"
 
     def __post_init__(self) -> None:
-        for name, allowed in (("flavor", FLAVORS), ("range_rule", RANGE_RULES), ("range_axis", RANGE_AXES)):
-            if getattr(self, name) not in allowed:
-                raise ValueError(f"{name}: expected {' or '.join(allowed)}, got {getattr(self, name)!r}")
+        if isinstance(self.classes, str) or not self.classes:
+            raise ValueError(f"classes: expected a list of class names, got {self.classes!r}")
+        ranges = tuple((low, high) for low, high in self.ranges)
+        ious = {name: tuple(float(value) for value in values) for name, values in self.ious.items()}
+        plain = {"classes": tuple(self.classes), "metrics": tuple(self.metrics), "ranges": ranges, "ious": ious}
+        for name, value in plain.items():
+            object.__setattr__(self, name, value)
+        self._check_choices()
+        self._check_limits()
 
-    @cached_property
-    def dontcare(self) -> Mask:
-        """(G,) which labels are DontCare areas; the port reads the name case-sensitively."""
-        labels = self.pair.labels
-        return labels.is_exactly("DontCare") if self.flavor == "python" else labels.is_type("DontCare")
+    def _check_choices(self) -> None:
+        choices = (("recall", RecallPoints), ("flavor", Flavor), ("range_rule", RangeRule), ("range_axis", RangeAxis))
+        for name, allowed in choices:
+            if getattr(self, name) not in get_args(allowed):
+                expected = " or ".join(str(choice) for choice in get_args(allowed))
+                raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)!r}")
+        if self.iou_set not in get_args(IouSet):
+            raise ValueError(f"IoU set: expected one of {', '.join(get_args(IouSet))}, got {self.iou_set!r}")
+        wrong = [metric for metric in self.metrics if metric not in METRICS]
+        if wrong or not self.metrics:
+            raise ValueError(f"metric: expected some of {', '.join(METRICS)}, got {wrong[0] if wrong else 'none'!r}")
+        _ = self.rule  # a misspelt one is refused here
 
-    @cached_property
-    def _level_counts(self) -> Mask:
-        labels = self.pair.labels
-        return self.difficulty.counts(labels.height_2d, labels.values[:, 0], labels.values[:, 1])
+    def _check_limits(self) -> None:
+        if any(name.lower() == "dontcare" for name in self.classes):
+            raise ValueError("classes: DontCare marks areas and cannot be evaluated")
+        for name, values in self.ious.items():
+            if name.lower() not in {cls.lower() for cls in self.classes}:
+                raise ValueError(f"IoU of {name}: that class is not evaluated ({', '.join(self.classes)} are)")
+            for value in values:
+                if not 0 <= value < 1:
+                    raise ValueError(f"IoU of {name}: expected 0 <= IoU < 1 (a match needs more than it), got {value}")
+        for low, high in self.ranges:
+            if high is not None and not low < high:
+                raise ValueError(f"range: expected LO < HI in metres, got {low} {high}")
 
-    @cached_property
-    def _overlaps(self) -> dict[str, Overlaps]:
-        return {}
+    @property
+    def rule(self) -> DifficultyRule:
+        """The rule that `difficulty` names."""
+        return difficulty_named(self.difficulty, self.flavor) if isinstance(self.difficulty, str) else self.difficulty
 
-    def overlaps(self, kind: str) -> Overlaps:
-        """Pairs of the kind "2d", "bev" or "3d" with any overlap at all."""
-        if kind not in self._overlaps:
-            found = overlaps_of(self.pair.labels, self.pair.detections, kind, floor=0.0, dontcare=self.dontcare)
-            if self.flavor == "python" and kind != "2d":
-                found.dontcare[:] = 0.0  # the port knows DontCare in the image only
-            self._overlaps[kind] = found
-        return self._overlaps[kind]
-
-    def in_range(self, table: ObjectTable, bounds: Range) -> Mask:
-        """(N,) whether lo <= distance < hi; everything is inside (0, None)."""
-        lo, hi = bounds
-        if bounds == EVERYWHERE:
-            return np.ones(len(table), dtype=bool)
-        distance = table.values[:, Z]
-        if self.range_axis == "radius":
-            distance = np.hypot(table.values[:, X], distance)
-        return np.asarray((distance >= lo) & (distance < (np.inf if hi is None else hi)))
-
-    def flags(self, target: Target, level: int) -> tuple[Flags, Flags]:
-        """Flags of labels (G,) and detections (D,) at a difficulty level (0 easy, 1 moderate, 2 hard)."""
-        labels, detections = self.pair.labels, self.pair.detections
-        on_label = label_flags(labels, target.cls, self._level_counts[level], self.in_range(labels, target.range))
-        on_detection = detection_flags(detections, target.cls, self.difficulty.min_height[level], self.flavor)
-        outside = ~self.in_range(detections, target.range)
-        if self.range_rule == "clocs":
-            on_detection[outside] = INVISIBLE
-        elif outside.any():
-            overlaps = self.overlaps(target.overlap)
-            label_of_pair = np.repeat(np.arange(len(labels)), np.diff(overlaps.start))
-            hits = (overlaps.iou > target.iou) & (on_label[label_of_pair] == VALID)
-            outside[overlaps.detection[hits]] = False
-            on_detection[outside & (on_detection == VALID)] = IGNORED
-        return on_label, on_detection
-
-    def records(self, target: Target, level: int) -> MatchRecords:
-        """Both matching passes over all frames."""
-        labels, detections = self.pair.labels, self.pair.detections
-        alphas = (labels.alpha, detections.alpha)
-        return record_matches(labels.offsets, detections.offsets, self.match_candidates(target, level), alphas)
-
-    def match_candidates(self, target: Target, level: int) -> MatchCandidates:
-        """Overlaps, flags and scores of one target and level, as the matching takes them."""
-        flags = self.flags(target, level)
-        return match_candidates(self.overlaps(target.overlap), target.iou, flags, self.pair.detections.score)
-
-    def is_evaluated(self, target: Target) -> bool:
-        """Whether the reference gives a value: the class is detected at least once, and for AOS with orientation."""
-        detections = self.pair.detections
-        kept = self.in_range(detections, target.range) if self.range_rule == "clocs" else np.ones(len(detections), bool)
-        if target.metric == "aos" and not self._has_orientation(kept):
-            return False
-        usable = kept & detections.is_type(target.cls)
-        if self.flavor == "cpp":
-            column, least = {"2d": (3, 0.0), "bev": (X, None), "3d": (Y, None)}[target.overlap]
-            value = detections.values[:, column]
-            usable &= value != -1000 if least is None else value >= least
-        return bool(usable.any())
-
-    def _has_orientation(self, kept: Mask) -> bool:
-        """cpp: no detection at all has alpha -10; python: the first one has not."""
-        alpha = self.pair.detections.alpha[kept]
-        if len(alpha) == 0:
-            return False
-        return bool(alpha[0] != -10) if self.flavor == "python" else not bool((alpha == -10).any())
-
-
-def levels(matcher: Matcher, target: Target) -> Iterator[MatchRecords]:
-    """Match records at easy, moderate and hard."""
-    for level in range(3):
-        yield matcher.records(target, level)
+    @property
+    def targets(self) -> tuple[Target, ...]:
+        """Every row asked for, each once (image rows of the strict and loose set are the same)."""
+        sets = ("strict", "loose") if self.iou_set == "both" else (self.iou_set,)
+        own = {name.lower(): values for name, values in self.ious.items()}
+        rows = [
+            Target(cls, metric, min_overlap(cls, metric, limit) if isinstance(limit, str) else limit, bounds)
+            for bounds in self.ranges
+            for cls in self.classes
+            for limit in own.get(cls.lower(), sets)
+            for metric in self.metrics
+        ]
+        return tuple(dict.fromkeys(rows))

@@ -11,7 +11,7 @@ from detection.evaluation.bootstrap import Interval, Resampling, confidence_inte
 from detection.evaluation.difficulty import LEVELS
 from detection.evaluation.explain import FALSE_POSITIVE, MATCHED, MISSED, Explanation, explain
 from detection.evaluation.kitti_ap import Evaluation, prepare
-from detection.evaluation.protocol import Target
+from detection.evaluation.protocol import EVERYWHERE, METRICS, Target
 from detection.kitti_format import KittiObject
 from pipeline.base.errors import DataError
 from pipeline.base.paths import RunFolder
@@ -65,8 +65,8 @@ def judge(config: Config, run: RunFolder, dataset: Dataset, frames: Sequence[str
         labels[frame_id], detections[frame_id] = pair
     if not labels:
         return MatchedFrames()
-    section = config.evaluation
-    evaluation = prepare(labels, detections, classes=section.classes, recall=section.recall, iou_set=section.iou_set)
+    # Curves and mistakes are shown over all distances; metrics.json has the ranges asked for.
+    evaluation = prepare(labels, detections, config.evaluation, metrics=METRICS, ranges=(EVERYWHERE,))
     return MatchedFrames(labels, detections, evaluation, verdicts(evaluation))
 
 
@@ -189,10 +189,9 @@ def difference_rows(first: MatchedFrames, second: MatchedFrames) -> list[list[st
 
 
 def _on(matched: MatchedFrames, frames: Sequence[str], like: Evaluation) -> Evaluation:
-    """The evaluation on some frames, with the targets of `like`."""
+    """The evaluation on some frames, by the protocol of `like`."""
     labels = {frame: matched.labels[frame] for frame in frames}
-    part = prepare(labels, {frame: matched.detections[frame] for frame in frames})
-    return Evaluation(part.matcher, like.targets, like.recall_points)
+    return prepare(labels, {frame: matched.detections[frame] for frame in frames}, like.protocol)
 
 
 # --- precision-recall curves as SVG paths

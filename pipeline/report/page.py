@@ -224,7 +224,8 @@ def headline(metrics: dict[str, Any], frames: int) -> list[tuple[str, str, str]]
     facts = [(str(frames), "frames", "")]
     for metric, name in (("3d", "Car 3D AP"), ("bev", "Car bird's-eye AP")):
         for row in metrics.get("results", []):
-            if (row["class"], row["metric"], row["iou"]) == ("Car", metric, 0.7) and row["moderate"] is not None:
+            asked = (row["class"], row["metric"], row["iou"], *row["range"]) == ("Car", metric, 0.7, 0, None)
+            if asked and row["moderate"] is not None:
                 remark = f"moderate, IoU 0.7, R{row['recall_points']}, {row['n_gt'][1]} cars"
                 facts.append((f"{row['moderate']:.1f}", name, remark))
     depth = metrics.get("depth", {}).get("mean", {})

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator, ValidationError
 
+from detection.evaluation.protocol import EvaluationProtocol
 from pipeline.base.errors import UsageError
-from pipeline.base.settings import nearest_name
+from pipeline.base.settings import nearest_name, plain, with_changes
 from pipeline.base.yaml_files import parse_yaml, read_yaml
 
 
@@ -75,12 +76,13 @@ class DetectionConfig(Section):
     device: str = "cpu"
 
 
-class EvaluationConfig(Section):
-    """KITTI AP."""
-
-    classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist")
-    recall: Literal[40, 11] = 40
-    iou_set: Literal["strict", "loose", "both"] = "strict"
+def _protocol(value: object) -> EvaluationProtocol:
+    """The evaluation section as the library's own dataclass."""
+    if isinstance(value, EvaluationProtocol):
+        return value
+    if not isinstance(value, Mapping):
+        raise ValueError("expected keys with values")
+    return with_changes(EvaluationProtocol(), value, "evaluation")
 
 
 class ReportConfig(Section):
@@ -122,7 +124,7 @@ class Config(Section):
     completion: CompletionConfig = CompletionConfig()
     augment: AugmentConfig = AugmentConfig()
     detection: DetectionConfig = DetectionConfig()
-    evaluation: EvaluationConfig = EvaluationConfig()
+    evaluation: Annotated[EvaluationProtocol, PlainValidator(_protocol), PlainSerializer(plain)] = EvaluationProtocol()
     report: ReportConfig = ReportConfig()
     train: TrainConfig = TrainConfig()
     run: RunConfig = RunConfig()
@@ -156,6 +158,8 @@ def parse_config(tree: Mapping[str, Any], where: str) -> Config:
         return Config.model_validate(tree)
     except ValidationError as error:
         raise UsageError(f"{where}: {_explain(error)}") from None
+    except UsageError as error:
+        raise UsageError(f"{where}: {error}") from None
 
 
 def config_path(source: str | Path | None) -> Path:

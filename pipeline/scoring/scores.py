@@ -124,15 +124,7 @@ def scores(config: Config, collected: Collected) -> dict[str, Any]:
     if collected.labels:
         from detection.evaluation.kitti_ap import evaluate
 
-        section = config.evaluation
-        report = evaluate(
-            collected.labels,
-            collected.detections,
-            classes=section.classes,
-            recall=section.recall,
-            iou_set=section.iou_set,
-        )
-        metrics.update(report)
+        metrics.update(evaluate(collected.labels, collected.detections, config.evaluation))
     return metrics
 
 

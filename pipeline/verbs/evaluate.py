@@ -6,17 +6,19 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 from auglidar_base.atomic import write_text
+from detection.evaluation.protocol import EvaluationProtocol
+from pipeline.base.meanings import meanings
 
 if TYPE_CHECKING:
     from detection.evaluation.bootstrap import Resampling
     from detection.evaluation.kitti_ap import Evaluation, Report
-    from detection.evaluation.protocol import Range
 
 
 EXAMPLES = """\
@@ -34,38 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--labels", required=True, metavar="DIR", help="KITTI label files (label_2)")
     parser.add_argument("--detections", required=True, metavar="DIR", help="KITTI result files, one per frame")
     parser.add_argument("--split", metavar="FILE", help="names of the frames to evaluate (every labelled frame)")
-    parser.add_argument("--classes", default="Car,Pedestrian,Cyclist", metavar="Car,...", help="all three")
-    parser.add_argument("--metrics", default="2d,aos,bev,3d", metavar="2d,...", help="2d, aos, bev and 3d")
-    parser.add_argument("--recall", type=int, choices=(40, 11), default=40, help="recall points (40)")
-    parser.add_argument(
-        "--iou-set", choices=("strict", "loose", "both"), default="both", help="limits of BEV and 3D (both)"
-    )
-    parser.add_argument(
-        "--iou", action="append", default=[], metavar="CLASS=IOU", help="instead of the sets; may be repeated"
-    )
-    parser.add_argument("--flavor", choices=("cpp", "python"), default="cpp", help="official devkit or the Python port")
-    parser.add_argument(
-        "--range",
-        nargs=2,
-        type=float,
-        action="append",
-        dest="ranges",
-        metavar=("LO", "HI"),
-        help="only LO <= z < HI metres (HI may be inf); may be repeated",
-    )
-    parser.add_argument(
-        "--range-rule",
-        choices=("clocs", "border"),
-        default="clocs",
-        help="detections outside: dropped, or kept where they find a label inside",
-    )
-    parser.add_argument("--range-axis", choices=("z", "radius"), default="z", help="depth or distance on the ground")
-    parser.add_argument(
-        "--difficulty",
-        default="kitti",
-        metavar="RULE",
-        help="kitti, or vkitti2 with options as vkitti2:and:bands:ignore (docs/evaluation.md)",
-    )
+    add_protocol(parser.add_argument_group("protocol"))
     parser.add_argument(
         "--missing",
         choices=("error", "skip", "empty"),
@@ -88,6 +59,54 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", metavar="FILE", help="write the results as JSON; - for stdout")
     parser.add_argument("--markdown", metavar="FILE", help="write the table as Markdown; - for stdout")
     parser.add_argument("--latex", metavar="FILE", help="write the table as LaTeX; - for stdout")
+
+
+def add_protocol(group: argparse._ArgumentGroup) -> None:
+    """One option for every field of `EvaluationProtocol`; an option that is not given leaves the field's default."""
+    meaning, hints = meanings(EvaluationProtocol), typing.get_type_hints(EvaluationProtocol)
+    for field in fields(EvaluationProtocol):
+        option, how = SPELLING.get(field.name, (f"--{field.name.replace('_', '-')}", {}))
+        if typing.get_origin(hints[field.name]) is Literal:
+            choices = typing.get_args(hints[field.name])
+            how = {"choices": choices, "type": type(choices[0]), **how}
+        known = f" ({field.default})" if isinstance(field.default, (str, int)) else ""
+        text = meaning.get(field.name, "").replace("%", "%%") + known
+        group.add_argument(option, dest=field.name, **{"help": text, **how})
+
+
+def protocol_of(args: argparse.Namespace) -> EvaluationProtocol:
+    """The protocol of the options that were given."""
+    given = {field.name: getattr(args, field.name) for field in fields(EvaluationProtocol)}
+    given = {name: value for name, value in given.items() if value is not None}
+    if "ious" in given:
+        given["ious"] = _class_ious(given["ious"])
+    if "ranges" in given:
+        given["ranges"] = [(low, None if math.isinf(high) else high) for low, high in given["ranges"]]
+    return EvaluationProtocol(**given)
+
+
+def _names(text: str) -> list[str]:
+    """The parts of a,b,c."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+# Options that are not simply called and written like their field.
+SPELLING: Mapping[str, tuple[str, dict[str, Any]]] = {
+    "classes": ("--classes", {"type": _names, "metavar": "Car,..."}),
+    "metrics": ("--metrics", {"type": lambda text: _names(text.lower()), "metavar": "2d,..."}),
+    "ious": ("--iou", {"action": "append", "metavar": "CLASS=IOU", "help": "instead of the sets; may be repeated"}),
+    "ranges": (
+        "--range",
+        {
+            "action": "append",
+            "nargs": 2,
+            "type": float,
+            "metavar": ("LO", "HI"),
+            "help": "only LO <= distance < HI metres (HI may be inf); may be repeated",
+        },
+    ),
+    "difficulty": ("--difficulty", {"metavar": "RULE"}),
+}
 
 
 def run(args: argparse.Namespace) -> int:
@@ -132,26 +151,11 @@ def _run(args: argparse.Namespace) -> int:
 
 def _prepare(args: argparse.Namespace, detections: str) -> Evaluation:
     from detection.evaluation.kitti_ap import prepare
-    from detection.evaluation.protocol import EVERYWHERE
     from detection.evaluation.reading import read_split
 
-    ranges: Sequence[Range] = [(lo, None if math.isinf(hi) else hi) for lo, hi in args.ranges or []]
+    frames = read_split(args.split) if args.split else None
     return prepare(
-        args.labels,
-        detections,
-        classes=[name.strip() for name in args.classes.split(",") if name.strip()],
-        metrics=[name.strip().lower() for name in args.metrics.split(",") if name.strip()],
-        recall=args.recall,
-        iou_set=args.iou_set,
-        ious=_class_ious(args.iou),
-        flavor=args.flavor,
-        ranges=ranges or [EVERYWHERE],
-        range_rule=args.range_rule,
-        range_axis=args.range_axis,
-        difficulty=args.difficulty,
-        frames=read_split(args.split) if args.split else None,
-        missing=args.missing,
-        lenient=args.lenient,
+        args.labels, detections, protocol_of(args), frames=frames, missing=args.missing, lenient=args.lenient
     )
 
 

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
 
 from detection.evaluation.kitti_ap import evaluate
+from detection.evaluation.protocol import EvaluationProtocol
 from detection.kitti_format import format_line
-from pipeline.verbs.evaluate import add_arguments, run
+from pipeline.base.settings import plain
+from pipeline.run_folder.config import load_config
+from pipeline.verbs.evaluate import add_arguments, protocol_of, run
 from tests.detection.evaluation.scenes import random_frames, thing
 
 
@@ -148,3 +152,38 @@ def test_lenient_continues_and_counts(folders: tuple[str, ...], tmp_path: Path) 
     assert call(*folders, "--lenient", "--json", tmp_path / "ap.json") == 0
     skipped = json.loads((tmp_path / "ap.json").read_text())["skipped"]
     assert skipped == {"broken line": 2, "missing result file": 1, "result of unknown frame": 1}
+
+
+# One option and the value it gives, for every field of the protocol.
+PROTOCOL_OPTIONS = {
+    "classes": (["--classes", "Car, Van"], ("Car", "Van")),
+    "metrics": (["--metrics", "BEV,3d"], ("bev", "3d")),
+    "recall": (["--recall", "11"], 11),
+    "iou_set": (["--iou-set", "loose"], "loose"),
+    "ious": (["--iou", "Car=0.3", "--iou", "Car=0.6"], {"Car": (0.3, 0.6)}),
+    "flavor": (["--flavor", "python"], "python"),
+    "ranges": (["--range", "0", "30", "--range", "30", "inf"], ((0, 30), (30, None))),
+    "range_rule": (["--range-rule", "border"], "border"),
+    "range_axis": (["--range-axis", "radius"], "radius"),
+    "difficulty": (["--difficulty", "vkitti2:and"], "vkitti2:and"),
+}
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(EvaluationProtocol)])
+def test_every_field_of_the_protocol_has_one_option_and_a_key(name: str) -> None:
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    options, value = PROTOCOL_OPTIONS[name]
+    asked = protocol_of(parser.parse_args(["--labels", "a", "--detections", "b", *options]))
+    assert asked == replace(EvaluationProtocol(), **{name: value}) != EvaluationProtocol()
+    text = json.dumps(plain(value))
+    assert load_config("nyuv2", [f"evaluation.{name}={text}"]).evaluation == asked
+    group = next(group for group in parser._action_groups if group.title == "protocol")
+    assert [action.dest for action in group._group_actions] == [field.name for field in fields(EvaluationProtocol)]
+    assert all(action.help for action in group._group_actions)
+
+
+def test_no_option_means_the_default_protocol() -> None:
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    assert protocol_of(parser.parse_args(["--labels", "a", "--detections", "b"])) == EvaluationProtocol()
