@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 from collections.abc import Callable, Iterable
@@ -39,18 +40,29 @@ def task_key(
 
 
 def part_hash(frame: Frame, part: str, file_hash: Callable[[Path], str]) -> str:
-    """Hash of the files a part is read from, or of its value when the reader names no file."""
+    """Hash of the files a part is read from, or of its value when the reader names no file or a folder.
+
+    A folder (the recording day of KITTI raw, the root of Virtual KITTI 2) does not tell which of its files are read.
+    """
     if not frame.has(part):
         return "none"
     files = frame.files(part)
-    if files:
+    if files and not any(path.is_dir() for path in files):
         return ",".join(file_hash(path) for path in files)
     try:
         value = getattr(frame, part)
     except DataError as error:
         return f"unreadable: {error}"
-    data = np.ascontiguousarray(value).tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
-    return content_hash(data)
+    return content_hash(_content(value))
+
+
+def _content(value: Any) -> bytes:
+    """All digits of an array, also within a dataclass (a calibration); the text of anything else."""
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype} {value.shape} ".encode() + np.ascontiguousarray(value).tobytes()
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return b"|".join(_content(getattr(value, field.name)) for field in dataclasses.fields(value))
+    return repr(value).encode()
 
 
 @lru_cache(maxsize=64)

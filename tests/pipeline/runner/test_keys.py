@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.base.seeds import derive_seed
 from pipeline.data.frame import Frame
+from pipeline.geometry.calibration import Calibration
 from pipeline.run_folder.frame_outputs import content_hash
 from pipeline.runner.keys import code_version, part_hash, stage_key, task_key
 
@@ -51,6 +52,21 @@ def test_parts_without_files_are_recognised_by_content() -> None:
 
     assert part(1.0) == part(1.0) != part(2.0)
     assert part_hash(Frame("1", {}), "points", file_hash) == "none"
+
+
+def test_parts_read_from_a_folder_are_recognised_by_content(tmp_path: Path) -> None:
+    def calibration(folder: Path) -> Calibration:
+        P2 = np.eye(3, 4)
+        P2[0, 3] = float((folder / "calib.txt").read_text())
+        return Calibration(P2=P2, R0_rect=np.eye(3), T_cam0_velo=np.eye(4))
+
+    frame = {"calibration": partial(calibration, tmp_path)}
+    hashes = []
+    # The ninth digit counts too; a printed array has eight.
+    for text in ("1.0", "1.000000001", "1.0"):
+        (tmp_path / "calib.txt").write_text(text)
+        hashes.append(part_hash(Frame("1", frame), "calibration", file_hash))
+    assert hashes[0] == hashes[2] != hashes[1]
 
 
 def test_code_versions_differ_between_rooms() -> None:
