@@ -1,1 +1,1 @@
-"""What all three rooms stand on: files that appear whole, pickles read without running them. It imports no room."""
+"""What all three rooms stand on: whole files, inert pickles, children that end. It imports no room."""

@@ -20,6 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from auglidar_base.children import loader_worker
 from completion.checkpoints import Card, load_checkpoint, save_checkpoint
 from completion.decoding import default_decoding
 from completion.diagnostics import diagnose
@@ -273,6 +274,7 @@ class _Run:
             sampler=range(start, self.total),
             num_workers=workers,
             prefetch_factor=4 if workers else None,
+            worker_init_fn=loader_worker,
         )
         return iter(loader)
 

@@ -21,6 +21,7 @@ import torch.distributed as dist
 from numpy.typing import NDArray
 from torch import Tensor
 
+from auglidar_base.children import end_with_parent
 from detection.checkpoints import load_checkpoint, load_tensors, save_checkpoint, save_tensors
 from detection.data_augmentation import (
     DatabaseObject,
@@ -374,6 +375,7 @@ def _train_worker(rank: int, count: int, port: int, arguments: tuple[Any, ...]) 
     os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(count), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
     torch.set_num_threads(1)
     settings, samples, out, progress = arguments
+    end_with_parent()
     try:
         train(settings, samples, out, progress=progress)
     finally:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import contextlib
 import difflib
+import signal
 import sys
 from collections.abc import Sequence
 from typing import Any
 
 from pipeline.base.errors import DataError, UsageError
+from pipeline.runner.signals import Terminated, sigterm_as_interrupt
 from pipeline.verbs import available_verbs, verb_module
 from pipeline.verbs.parsers import STAGE_HELP, main_parser, verb_parser
 
@@ -18,13 +20,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The console script; returns the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
-        return _dispatch(arguments)
+        with sigterm_as_interrupt():
+            return _dispatch(arguments)
     except (UsageError, DataError) as error:
         print(f"run_pipeline: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         print("run_pipeline: interrupted; the same command continues where it was", file=sys.stderr)
-        return 130
+        return 128 + (signal.SIGTERM if isinstance(interrupt, Terminated) else signal.SIGINT)
     except BrokenPipeError:
         # The reader of our output went away (`run_pipeline ... | head`).
         sys.stderr.close()

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from itertools import islice
 from typing import TypeVar
+
+from auglidar_base.children import process_pool
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -29,10 +30,8 @@ def map_ordered(function: Callable[[Item], Result], items: Iterable[Item], worke
     if workers <= 1:
         yield from map(function, items)
         return
-    # Started afresh rather than forked: threads of torch or OpenCV in this process would not survive a fork.
-    context = multiprocessing.get_context("spawn")
     waiting = iter(items)
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_one_thread) as pool:
+    with process_pool(workers, _one_thread) as pool:
         under_way: deque[Future[Result]] = deque(pool.submit(function, item) for item in islice(waiting, 4 * workers))
         while under_way:
             result = under_way.popleft().result()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import sys
 import warnings
 from collections import deque
@@ -18,6 +17,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Protocol
 
+from auglidar_base.children import start_child
 from pipeline.base.errors import UsageError
 from pipeline.runner.jobs import Outcome, Task, crashed
 
@@ -138,11 +138,9 @@ class _WorkerProcess:
     """A process, the pipe to it, and the tasks it was given, the one in hand first."""
 
     def __init__(self, make_worker: WorkerFactory) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.pipe, inner = context.Pipe()
-        self.process: BaseProcess = context.Process(target=_serve, args=(inner, make_worker), daemon=True)
+        self.pipe, inner = multiprocessing.get_context("spawn").Pipe()
         with _one_thread_for_children():
-            self.process.start()
+            self.process: BaseProcess = start_child(inner, _serve, make_worker)
         inner.close()
         self.tasks: deque[Task] = deque()
         self.ended = False
@@ -180,9 +178,6 @@ class _WorkerProcess:
 
 def _serve(pipe: Connection, make_worker: WorkerFactory) -> None:
     """Body of a worker process: answers tasks until the parent closes the pipe or dies."""
-    # Ctrl-C reaches the whole process group; the parent decides when to stop, so that the frame in hand is finished.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     use_one_thread()
     worker: Worker | None = None
     while True:

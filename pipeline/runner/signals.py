@@ -1,4 +1,10 @@
-"""SIGINT and SIGTERM ask for a stop; the frame in hand is finished. A second signal ends the program at once."""
+"""One policy for SIGINT and SIGTERM, whichever stage or verb is at work.
+
+Frames in hand are finished where that is quick (`stop_on_signals`, around the frame stages). Everywhere else both
+signals raise KeyboardInterrupt (`sigterm_as_interrupt`, around the whole program): pools are ended, half-written files
+removed. A second signal ends the program at once. Child processes leave both signals to their parent and end with it
+(`auglidar_base.children`). The exit code is 128 + the signal's number: 130 or 143.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +13,28 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, raised where Ctrl-C would be."""
+
+
+@contextmanager
+def sigterm_as_interrupt() -> Iterator[None]:
+    """SIGTERM raises `Terminated` while the block runs (main thread only; elsewhere nothing changes)."""
+
+    def on_signal(number: int, _: FrameType | None) -> None:
+        signal.signal(number, signal.SIG_DFL)
+        raise Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, on_signal)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 class StopRequest:

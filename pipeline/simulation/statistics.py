@@ -157,10 +157,9 @@ def describe_synthetic(frames: int, seed: int, workers: int) -> list[FrameStatis
     work = partial(_describe_synthetic, seed)
     if workers <= 1:
         return [work(index) for index in range(frames)]
-    from concurrent.futures import ProcessPoolExecutor
-    from multiprocessing import get_context
+    from auglidar_base.children import process_pool
 
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+    with process_pool(workers) as pool:
         return list(pool.map(work, range(frames), chunksize=4))
 
 

@@ -75,10 +75,11 @@ def _completed(root: Path, settings: SynthSettings, jobs: list[int], workers: in
         for job in jobs:
             yield _run(root, settings, job)
         return
-    from concurrent.futures import ProcessPoolExecutor, as_completed
-    from multiprocessing import get_context
+    from concurrent.futures import as_completed
 
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_one_thread) as pool:
+    from auglidar_base.children import process_pool
+
+    with process_pool(workers, _one_thread) as pool:
         for future in as_completed([pool.submit(_run, root, settings, job) for job in jobs]):
             yield future.result()
 
