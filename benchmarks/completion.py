@@ -26,8 +26,18 @@ from benchmarks.record import Measure, measure_of, save
 from benchmarks.street_twise import cropped, given, street_twise
 from benchmarks.targets import EAGER
 from benchmarks.timing import Comparison, compare, format_table
-from completion.backends import export_onnx, onnxruntime_session, openvino_session, own_kernels
+from completion.backends import (
+    Session,
+    export_onnx,
+    kernel_executor,
+    onnxruntime_session,
+    openvino_session,
+    session_executor,
+    torch_executor,
+)
 from completion.checkpoints import load_checkpoint
+from completion.cpu.hourglass import hourglass_forward
+from completion.executors import Executor, Forward, finest_of
 from completion.infer import NetworkCompleter
 from completion.models import ModelSpec, default_spec
 from completion.types import DepthFrame
@@ -101,12 +111,17 @@ def streets(count: int, first: int = 0) -> list[DepthFrame]:
     return frames
 
 
-def backends(graph: bytes) -> dict[str, Callable[..., Tensor]]:
+def sessions(graph: bytes) -> dict[str, Session]:
     """The installed runtimes that run exports."""
     found = {"ONNX Runtime": onnxruntime_session(graph)}
     if find_spec("openvino"):
         found["OpenVINO"] = openvino_session(graph)
     return found
+
+
+def in_session(session: Session, sparse: Tensor, rgb: Tensor) -> Tensor:
+    """An exported network as a `Forward`."""
+    return session((sparse, rgb))
 
 
 def within_1_mm(a: Tensor, b: Tensor) -> bool:
@@ -123,9 +138,9 @@ def twise_measures(channels: int, size: tuple[int, int], repeats: int, limits: d
     frames = [cropped(one, *size, left=10) for one in streets(2, first=1)]
     sparse, rgb = given(frames[0])
     work, traffic, products = work_of(model, tuple(sparse.shape), tuple(rgb.shape))
-    ways: dict[str, Callable[..., Tensor]] = {EAGER: lambda *inputs: model(*inputs)[0], OWN: own_kernels(model)}
+    ways: dict[str, Forward] = {EAGER: finest_of(model), OWN: hourglass_forward(model)}
     if find_spec("onnx") and find_spec("onnxruntime"):
-        ways |= backends(export_onnx(model))
+        ways |= {name: partial(in_session, session) for name, session in sessions(export_onnx(model)).items()}
     last = copy.deepcopy(model).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     ways["torch, channels last"] = lambda depth, colour: last(
         depth, colour.contiguous(memory_format=torch.channels_last)
@@ -161,7 +176,7 @@ def roofline(row: Comparison, work: float, traffic: float, products: float, limi
     )
 
 
-def surface_mae(way: Callable[..., Tensor], frames: list[DepthFrame]) -> float:
+def surface_mae(way: Forward, frames: list[DepthFrame]) -> float:
     """Mean absolute error in mm of the mean of both surfaces over all pixels with truth up to 80 m."""
     errors = []
     for frame in frames:
@@ -189,13 +204,14 @@ def bundled_measures(name: str, repeats: int, limits: dict[str, float]) -> list[
     spec: ModelSpec = card.model
     frames = streets(4, first=1)
 
-    def completer(convolutions: Callable[..., Tensor] | None) -> NetworkCompleter:
-        return NetworkCompleter(model, spec, decoding=card.decoding, convolutions=convolutions)
-
-    ways: dict[str, Callable[..., Tensor] | None] = {OWN: own_kernels(model), "torch, channels last": None}
+    ways: dict[str, Executor] = {
+        OWN: kernel_executor(model, spec, card.decoding),
+        "torch, channels last": torch_executor(model, spec, "cpu", card.decoding),
+    }
     if find_spec("onnx") and find_spec("onnxruntime"):
-        ways |= backends(export_onnx(model))
-    completers = {label: completer(way) for label, way in ways.items()}
+        for label, session in sessions(export_onnx(model)).items():
+            ways[label] = session_executor(model, spec, card.decoding, session)
+    completers = {label: NetworkCompleter(way) for label, way in ways.items()}
     one = frames[0]
     calls: dict[str, Callable[[], Any]] = {label: partial(depth_of, run, one) for label, run in completers.items()}
     ours = calls.pop(OWN)
@@ -227,11 +243,11 @@ def bundled_measures(name: str, repeats: int, limits: dict[str, float]) -> list[
 def coefficient_measures(name: str, repeats: int) -> list[Measure]:
     """The bundled Depth Coefficients network on a whole frame: our pass and the tensor operations it repeats."""
     model, card = load_checkpoint(name)
-    ways = {OWN: own_kernels(model), "torch, channels last": None}
-    runs = {
-        label: NetworkCompleter(model, card.model, decoding=card.decoding, convolutions=way)
-        for label, way in ways.items()
+    ways: dict[str, Executor] = {
+        OWN: kernel_executor(model, card.model, card.decoding),
+        "torch, channels last": torch_executor(model, card.model, "cpu", card.decoding),
     }
+    runs = {label: NetworkCompleter(way) for label, way in ways.items()}
     frame = streets(1, first=1)[0]
     calls: dict[str, Callable[[], Any]] = {label: partial(depth_of, run, frame) for label, run in runs.items()}
     ours = calls.pop(OWN)

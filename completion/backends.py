@@ -1,4 +1,4 @@
-"""Who computes the convolutions on the CPU: torch, kernels of our own, or an export in ONNX Runtime or OpenVINO.
+"""Which executor computes a network: torch, kernels of our own, or an export in ONNX Runtime or OpenVINO.
 
 Exports are kept in the user's cache folder ($XDG_CACHE_HOME/auglidar, ~/.cache/auglidar) under the SHA-256 of their
 weights; any image size fits one file. Deleting them is always safe.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -18,11 +18,14 @@ from torch import Tensor, nn
 
 from auglidar_base.atomic import write_bytes
 from completion.checkpoints import Card
-from completion.cpu import hourglass as hourglass_cpu
-from completion.cpu.pixel_unet import PixelUNetKernels
+from completion.cpu.hourglass import hourglass_forward
+from completion.cpu.ring_coefficients import WinogradCoefficients
+from completion.cpu.selection import FusedSelection, WinogradSelection
+from completion.executors import Executor, NetworkExecutor, finest_of
+from completion.models import ModelSpec
 from completion.models.hourglass import Hourglasses
 from completion.models.ring_coefficients import RingCoefficients
-from completion.models.selection import CANDIDATES, INPUTS, Selection
+from completion.models.selection import INPUTS, Selection
 
 BACKENDS = ("torch", "numba", "onnxruntime", "openvino", "auto")
 # Pure convolutions; the others encode depth or are too large to be worth it.
@@ -32,7 +35,8 @@ OPSET = 17
 # Part of the file names: raise it when the exported part of a network changes.
 EXPORT_VERSION = 1
 
-Convolutions = Callable[..., Tensor]
+# The inputs of an exported graph -> its output.
+Session = Callable[[Sequence[Tensor]], Tensor]
 
 
 class _Part(nn.Module):
@@ -49,8 +53,37 @@ class _Part(nn.Module):
         return output
 
 
-def other_than_torch(model: nn.Module, card: Card, device: str, backend: str) -> Convolutions | None:
-    """The convolutions of a network for `infer.NetworkCompleter`, or None when torch is to compute them.
+def torch_executor(model: nn.Module, spec: ModelSpec, device: str | torch.device, decoding: str) -> Executor:
+    """Torch on one device; what surrounds the convolutions of a selection network on the CPU is fused.
+
+    The network is moved to the device and set to `eval`. ValueError for a decoding that it does not offer.
+    """
+    place = torch.device(device)
+    moved = model.to(device=place, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+    if isinstance(moved, Selection) and place.type == "cpu":
+        return FusedSelection(moved, spec, decoding, moved.network.at_half)
+    return NetworkExecutor(finest_of(moved), spec, decoding, place)
+
+
+def kernel_executor(model: nn.Module, spec: ModelSpec, decoding: str) -> Executor:
+    """Our kernels (`completion.cpu`), with the network's weights and torch's threads at the time of this call."""
+    if isinstance(model, Selection):
+        return WinogradSelection(model, spec, decoding)
+    if isinstance(model, RingCoefficients):
+        return WinogradCoefficients(model, spec, decoding)
+    assert isinstance(model, Hourglasses), type(model)
+    return NetworkExecutor(hourglass_forward(model), spec, decoding)
+
+
+def session_executor(model: nn.Module, spec: ModelSpec, decoding: str, session: Session) -> Executor:
+    """An export of the network in another runtime."""
+    if isinstance(model, Selection):
+        return FusedSelection(model, spec, decoding, lambda features: session((features,)), planes=True)
+    return NetworkExecutor(lambda sparse, rgb: session((sparse, rgb)), spec, decoding)
+
+
+def choose_executor(model: nn.Module, card: Card, device: str, backend: str) -> Executor:
+    """The executor of a network.
 
     backend  one of BACKENDS; "auto" is "numba", the fastest, for the networks it can run, else torch
 
@@ -61,30 +94,20 @@ def other_than_torch(model: nn.Module, card: Card, device: str, backend: str) ->
     if backend == "auto":
         backend = "numba" if fits else "torch"
     if backend == "torch":
-        return None
+        return torch_executor(model, card.model, device, card.decoding)
     if not fits:
         raise ValueError(
             f"backend {backend!r} runs {', '.join(can)} on the CPU, not {card.model.architecture} on {device}; "
             "use backend 'torch'"
         )
     if backend == "numba":
-        return own_kernels(model)
+        return kernel_executor(model, card.model, card.decoding)
     for package in ("onnx", "onnxruntime") if backend == "onnxruntime" else ("onnx", "openvino"):
         if find_spec(package) is None:
             extra = "onnx" if backend == "onnxruntime" else "onnx,openvino"
             raise ImportError(f"backend {backend!r} needs {package}: pip install 'auglidar[{extra}]'")
-    graph = exported(model, card)
-    return onnxruntime_session(graph) if backend == "onnxruntime" else openvino_session(graph)
-
-
-def own_kernels(model: nn.Module) -> Convolutions:
-    """Our Winograd convolutions (`models.winograd`) with as many threads as torch."""
-    if isinstance(model, Selection):
-        return PixelUNetKernels(model.network, outputs=2 * CANDIDATES)  # no read-out needs the scale
-    if isinstance(model, RingCoefficients):
-        return PixelUNetKernels(model.network)
-    assert isinstance(model, Hourglasses), type(model)
-    return hourglass_cpu.convolutions(model)
+    start = onnxruntime_session if backend == "onnxruntime" else openvino_session
+    return session_executor(model, card.model, card.decoding, start(exported(model, card)))
 
 
 def cache_folder() -> Path:
@@ -107,7 +130,7 @@ def exported(model: nn.Module, card: Card) -> bytes:
 
 
 def export_onnx(model: nn.Module) -> bytes:
-    """ONNX graph for any batch and image size; inputs and output as in `NetworkCompleter`."""
+    """ONNX graph for any batch and image size: an `executors.Forward`, or `at_half` of a selection network."""
     channels = (4 * INPUTS,) if isinstance(model, Selection) else (1, 3)
     inputs = tuple(torch.rand(1, count, 64, 96) for count in channels)
     names = [f"input{number}" for number in range(len(inputs))]
@@ -128,7 +151,7 @@ def export_onnx(model: nn.Module) -> bytes:
         return path.read_bytes()
 
 
-def onnxruntime_session(graph: bytes) -> Convolutions:
+def onnxruntime_session(graph: bytes) -> Session:
     """ONNX Runtime with as many threads as torch; inputs and output as the graph has them."""
     import onnxruntime
 
@@ -137,13 +160,13 @@ def onnxruntime_session(graph: bytes) -> Convolutions:
     session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
     names = [given.name for given in session.get_inputs()]
 
-    def run(*inputs: Tensor) -> Tensor:
+    def run(inputs: Sequence[Tensor]) -> Tensor:
         return torch.from_numpy(session.run(None, {name: x.contiguous().numpy() for name, x in zip(names, inputs)})[0])
 
     return run
 
 
-def openvino_session(graph: bytes) -> Convolutions:
+def openvino_session(graph: bytes) -> Session:
     """OpenVINO with as many threads as torch; inputs and output as the graph has them."""
     import openvino
 
@@ -151,7 +174,7 @@ def openvino_session(graph: bytes) -> Convolutions:
     options = {"INFERENCE_NUM_THREADS": torch.get_num_threads(), "INFERENCE_PRECISION_HINT": "f32"}
     compiled = core.compile_model(core.read_model(graph), "CPU", options)
 
-    def run(*inputs: Tensor) -> Tensor:
+    def run(inputs: Sequence[Tensor]) -> Tensor:
         return torch.from_numpy(compiled([x.contiguous().numpy() for x in inputs])[0].copy())
 
     return run

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from completion.executors import NetworkExecutor, finest_of
 from completion.infer import NetworkCompleter
 from completion.models import ModelSpec
 
@@ -20,33 +21,39 @@ def tile_starts(width: int, tile_width: int) -> list[int]:
     return [min(start, max(0, width - tile_width)) for start in range(0, width, tile_width)]
 
 
-class TiledCompleter(NetworkCompleter):
-    """A Depth Coefficients network on tiles of `tile_width` columns and the bottom `rows` rows.
+class TiledExecutor(NetworkExecutor):
+    """A Depth Coefficients network on tiles of `tile_width` columns.
 
     ValueError for a network with another output: only logits can be summed.
     """
 
-    def __init__(
-        self,
-        model: nn.Module,
-        spec: ModelSpec,
-        device: str | torch.device = "cpu",
-        decoding: str = "peak",
-        rows: int | None = TILE_ROWS,
-        tile_width: int = TILE_WIDTH,
-    ) -> None:
+    def __init__(self, model: nn.Module, spec: ModelSpec, decoding: str, device: str, tile_width: int) -> None:
         if spec.output != "coefficients":
             raise ValueError(
                 f"tiles need a network with output 'coefficients', {spec.architecture} has {spec.output!r}"
             )
         if tile_width < 1:
             raise ValueError(f"tile_width: expected at least one column, got {tile_width}")
-        super().__init__(model, spec, device, decoding, rows)
+        on_device = model.to(device=torch.device(device), memory_format=torch.channels_last)  # type: ignore[call-overload]
+        super().__init__(finest_of(on_device.eval()), spec, decoding, device)
         self.tile_width = tile_width
 
-    def _network_output(self, sparse: Tensor, rgb: Tensor) -> Tensor:
+    def output(self, sparse: Tensor, rgb: Tensor) -> Tensor:
+        """See `NetworkExecutor.output`: the sum of the tiles'."""
         summed = sparse.new_zeros(len(sparse), self.spec.bins.channels, *sparse.shape[-2:])
         for start in tile_starts(sparse.shape[-1], self.tile_width):
             columns = slice(start, start + self.tile_width)
-            summed[..., columns] += super()._network_output(sparse[..., columns], rgb[..., columns])
+            summed[..., columns] += super().output(sparse[..., columns], rgb[..., columns])
         return summed
+
+
+def tiled_completer(
+    model: nn.Module,
+    spec: ModelSpec,
+    device: str = "cpu",
+    decoding: str = "peak",
+    rows: int | None = TILE_ROWS,
+    tile_width: int = TILE_WIDTH,
+) -> NetworkCompleter:
+    """The completer of `TiledExecutor` on the bottom `rows` rows; ValueError as there."""
+    return NetworkCompleter(TiledExecutor(model, spec, decoding, device, tile_width), rows)

@@ -25,7 +25,7 @@ from completion.checkpoints import Card, load_checkpoint, save_checkpoint
 from completion.decoding import default_decoding
 from completion.diagnostics import diagnose
 from completion.growth import adopt, grow
-from completion.infer import NetworkCompleter
+from completion.infer import NetworkCompleter, network_completer
 from completion.inputs import scale_rgb
 from completion.models import ModelSpec, build_model
 from completion.resume import load_state, save_state
@@ -368,7 +368,7 @@ class _Run:
         return self.settings.decoding or default_decoding(self.settings.model)
 
     def _completer(self) -> NetworkCompleter:
-        return NetworkCompleter(self.model, self.settings.model, self.device, self.decoding)
+        return network_completer(self.model, self.settings.model, self.device, self.decoding)
 
     def _card(self, step: int, facts: dict[str, Any]) -> Card:
         described = {

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from torch import Tensor, nn
 from completion.cpu import winograd
 from completion.cpu.row_threads import RowThreads
 from completion.cpu.winograd import COARSER, NOTHING, RECTIFIED
+from completion.executors import Forward
 from completion.models.blocks import DepthDecoder, DepthEncoder, RgbEncoder
 from completion.models.hourglass import Hourglasses
 
@@ -150,7 +150,7 @@ class _DepthDecoder(nn.Module):
         return head, (full, half, d2 + c2) if self.extra_skips else (full,)
 
 
-def convolutions(model: Hourglasses) -> Callable[[Tensor, Tensor], Tensor]:
+def hourglass_forward(model: Hourglasses) -> Forward:
     """(B, 1, H, W) and (B, 3, H, W) as the network takes them -> its finest output, with as many threads as torch.
 
     The weights are those at the time of this call. About 1 KB per pixel and 64 channels is held between frames

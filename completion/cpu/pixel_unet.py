@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,12 +21,18 @@ from completion.models.selection import PixelUNet, Residual
 Float = NDArray[np.float32]
 
 
+class Head(NamedTuple):
+    """The last layer: weights (2, C, 2 outputs) and bias (2, 2 outputs) for even and odd rows of the image; columns for
+    even and odd pixels side by side, zeros up to whole lanes."""
+
+    weights: Float
+    bias: Float
+
+
 class PixelUNetKernels:
     """The convolutions of a U-Net with its weights at the time of this call, and as many threads as torch has then.
 
     outputs  how many of the network's outputs are read (None: all): the first ones
-    head     (2, C, 2 outputs) weights and (2, 2 outputs) biases of the last layer, for even and odd rows; columns for
-             even and odd pixels side by side, zeros up to whole lanes
     lock     to be held while the result of `before_head` is in use: its memory is kept from frame to frame
     """
 
@@ -40,7 +46,7 @@ class PixelUNetKernels:
         self.up = [(with_whole_lanes(_array(one.weight[:, :, 0, 0].T)), winograd.bias_of(one)) for one in network.up]  # type: ignore[index]
         self.decoder = [_residual(one) for one in network.decoder]
         read = network.head.weight[:, :, 0, 0], _tensor(network.head.bias)
-        self.head = _head(read[0], outputs), _head(read[1], outputs)
+        self.head = Head(_head(read[0], outputs), _head(read[1], outputs))
 
     def __call__(self, features: Tensor) -> Tensor:
         """(1, 4 inputs, H/2, W/2) -> (1, 4 outputs, H/2, W/2), like `PixelUNet.at_half`."""
@@ -93,7 +99,7 @@ class PixelUNetKernels:
 def head_of(row, first, weights, rectified, out):  # type: ignore[no-untyped-def]
     """The last layer without its bias for len(out) pixels of a row (W/2, C) of `before_head` from `first` on.
 
-    weights (C, O) of `PixelUNetKernels.head`, rectified (n, C) for use inside, out (n, O)
+    weights (C, O) of `Head`, rectified (n, C) for use inside, out (n, O)
     """
     for i in range(len(out)):
         for c in range(row.shape[1]):

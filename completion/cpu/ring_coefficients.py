@@ -7,16 +7,20 @@ logits once, in the first-level cache; rings touch nine of them at most.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from completion.cpu.pixel_unet import PixelUNetKernels, head_of
+from completion.cpu.border import require
+from completion.cpu.pixel_unet import Head, PixelUNetKernels, head_of
 from completion.cpu.unet_inputs import Float, in_threads, unet_inputs
 from completion.cpu.vector_exp import exp
-from completion.depth_coefficients import Bins
-from completion.models.ring_coefficients import FLOOR
+from completion.decoding import require_decoding
+from completion.executors import FrameMaps
+from completion.models import ModelSpec
+from completion.models.ring_coefficients import FLOOR, RingCoefficients
 
 _RUN = 64  # pixels: their logits take 21 KB
 _ZERO, _HALF = np.float32(0), np.float32(0.5)
@@ -67,9 +71,24 @@ def _decode(logits, size, peak, top, where, out):  # type: ignore[no-untyped-def
         out[i] = size * moment / total
 
 
+class RingLogits(NamedTuple):
+    """What is added to the network's logits: rings (5, H, W) of a frame padded by `top` rows, see `UNetInputs`; and the
+    bins: their size in metres and their number."""
+
+    rings: Float
+    top: int
+    size: np.float32
+    channels: int
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _read_features(first, last, features, kernels, bias, rings, top, size, channels, peak, out):  # type: ignore[no-untyped-def]
-    """Rows first..last of out (h, w) from what the head convolves: features (H/2, W/2, C), see `PixelUNetKernels`."""
+def _read_features(first, last, features, head_layer, added, peak, out):  # type: ignore[no-untyped-def]
+    """Rows first..last of out (h, w) from what the head convolves: features (H/2, W/2, C), see `PixelUNetKernels`.
+
+    head_layer, added  `pixel_unet.Head` and `RingLogits`
+    """
+    kernels, bias = head_layer
+    rings, top, size, channels = added
     logits, code = np.zeros((channels, _RUN), np.float32), np.zeros(channels, np.float32)
     largest, where = np.empty(_RUN, np.float32), np.empty(_RUN, np.int32)
     rectified = np.empty((_RUN // 2, features.shape[2]), np.float32)
@@ -87,19 +106,46 @@ def _read_features(first, last, features, kernels, bias, rings, top, size, chann
             _decode(logits, size, peak, largest, where, out[y, start : start + _RUN])
 
 
-def complete_coefficients(
-    bins: Bins, convolutions: PixelUNetKernels, sparse: Float, image: NDArray[np.uint8], scaling: str, decoding: str
-) -> Float:
-    """Sparse (h, w) metres and image (h, w, 3) of any size -> depth (h, w).
+def read_coefficients(features: Float, head: Head, added: RingLogits, peak: bool, out: Float) -> None:
+    """Writes depth (h, w) to `out`, in as many threads as torch uses; see `_read_features`.
 
-    bins      with guard bins
-    scaling   of the colours, see `inputs.scale_rgb`
-    decoding  "all" or "peak", see `depth_coefficients.decode`
+    peak  expectation over the largest coefficient and its neighbours, else over all
+    ValueError for maps of other shapes or types than these.
     """
-    inputs = unet_inputs(sparse, image, scaling, planes=False)
-    depth = np.empty(sparse.shape, np.float32)
-    shape = np.float32(bins.size), bins.channels, decoding == "peak"
-    with convolutions.lock:
-        hidden = convolutions.before_head(inputs.features)
-        in_threads(_read_features, len(sparse), hidden, *convolutions.head, inputs.rings, inputs.top, *shape, depth)
-    return depth
+    _, height, width = require("rings", added.rings, (5, None, None))
+    outputs = require("head weights", head.weights, (2, features.shape[-1], None))[2]
+    require("features", features, (height // 2, width // 2, None))
+    require("head biases", head.bias, (2, outputs))
+    rows, columns = require("depth", out, (None, None))
+    if (
+        2 * added.channels > outputs
+        or rows + added.top > height
+        or columns > width
+        or min(added.channels - 3, added.top) < 0
+    ):
+        raise ValueError(
+            f"coefficients: {outputs} outputs of the head and rings {height} x {width} do not hold {added.channels} "
+            f"bins and a depth map {rows} x {columns} from row {added.top} on"
+        )
+    in_threads(_read_features, rows, features, head, added, peak, out)
+
+
+class WinogradCoefficients:
+    """`executors.Executor` of a ring-coefficients network with its weights at the time of this call.
+
+    ValueError for a decoding other than "all" and "peak", see `depth_coefficients.decode`.
+    """
+
+    def __init__(self, model: RingCoefficients, spec: ModelSpec, decoding: str) -> None:
+        require_decoding(spec, decoding)
+        self.kernels, self.bins, self.scaling = PixelUNetKernels(model.network), spec.bins, spec.rgb
+        self.peak = decoding == "peak"
+
+    def run(self, sparse: Float, rgb: NDArray[np.uint8]) -> FrameMaps:
+        """See `Executor`."""
+        inputs = unet_inputs(sparse, rgb, self.scaling, planes=False)
+        added = RingLogits(inputs.rings, inputs.top, np.float32(self.bins.size), self.bins.channels)
+        depth = np.empty(sparse.shape, np.float32)
+        with self.kernels.lock:
+            read_coefficients(self.kernels.before_head(inputs.features), self.kernels.head, added, self.peak, depth)
+        return FrameMaps(depth)

@@ -8,6 +8,7 @@ torch uses.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,10 +16,14 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
-from completion.cpu.pixel_unet import PixelUNetKernels, head_of
-from completion.cpu.unet_inputs import RUN, in_threads, unet_inputs
+from completion.cpu.border import require
+from completion.cpu.pixel_unet import Head, PixelUNetKernels, head_of
+from completion.cpu.unet_inputs import RUN, UNetInputs, in_threads, unet_inputs
 from completion.cpu.vector_exp import exp
+from completion.decoding import require_decoding
+from completion.executors import FrameMaps
 from completion.mixture import surface_shares
+from completion.models import ModelSpec
 from completion.models.selection import CANDIDATES, CHANNELS, COLUMN_SHIFTS, Selection
 from completion.twin_surface import fuse
 
@@ -106,15 +111,31 @@ def _quantile(depths, cumulated, share, out):  # type: ignore[no-untyped-def]
             out[i] = reached if reached < out[i] else out[i]
 
 
+class Candidates(NamedTuple):
+    """What the weights and corrections of a frame refer to.
+
+    logs      (3, H, W) of a frame padded by `top` rows, see `UNetInputs`
+    shifts    (S,) int64 columns
+    residual  see `Selection`
+    shares    (3,) of foreground, median and background
+    """
+
+    logs: Float
+    top: int
+    shifts: NDArray[np.int64]
+    residual: np.float32
+    shares: Float
+
+
 @njit(inline="always")
-def _distribution(weights, depths, cumulated, found, logs, y, start, shifts, residual, shares):  # type: ignore[no-untyped-def]
+def _distribution(weights, depths, cumulated, found, y, start, candidates):  # type: ignore[no-untyped-def]
     """Logits and corrections of a run of pixels -> weights, log depths, and found (4, n): log depth of foreground,
     median and background, weight of the foreground."""
-    _candidates(logs, y, start, shifts, residual, depths)
+    _candidates(candidates.logs, y, start, candidates.shifts, candidates.residual, depths)
     _softmax(weights, found[0])
     _cumulate(weights, depths, cumulated)
     for s in range(3):
-        _quantile(depths, cumulated, shares[s], found[s])
+        _quantile(depths, cumulated, candidates.shares[s], found[s])
     found[3] = _ZERO
     for k in range(CANDIDATES):
         for i in range(RUN):
@@ -142,23 +163,23 @@ def _write_run(weights, depths, cumulated, found, expected, y, start, out):  # t
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _read_rows(first, last, head, logs, top, shifts, residual, shares, expected, out):  # type: ignore[no-untyped-def]
+def _read_rows(first, last, head, candidates, expected, out):  # type: ignore[no-untyped-def]
     """Rows first..last of out (4, h, w): depth, foreground, background, sigma.
 
-    head (H/2, W/2, 84), logs (3, H, W); the image begins at row `top`; shares of foreground, median, background;
-    depth is the mean when `expected`, else the median.
+    head (H/2, W/2, 84); depth is the mean when `expected`, else the median.
     """
     weights, depths = np.zeros((CANDIDATES, RUN), np.float32), np.zeros((CANDIDATES, RUN), np.float32)
     cumulated, found = np.empty((CANDIDATES, RUN), np.float32), np.empty((4, RUN), np.float32)
+    top, width = candidates.top, candidates.logs.shape[2]
     for y in range(first, last):
         for start in range(0, out.shape[2], RUN):
-            _gather(head, y + top, start, min(RUN, logs.shape[2] - start), weights, depths)
-            _distribution(weights, depths, cumulated, found, logs, y + top, start, shifts, residual, shares)
+            _gather(head, y + top, start, min(RUN, width - start), weights, depths)
+            _distribution(weights, depths, cumulated, found, y + top, start, candidates)
             _write_run(weights, depths, cumulated, found, expected, y, start, out)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _read_features(first, last, features, kernels, bias, logs, top, shifts, residual, shares, expected, out):  # type: ignore[no-untyped-def]
+def _read_features(first, last, features, head_layer, candidates, expected, out):  # type: ignore[no-untyped-def]
     """`_read_rows` from what the head convolves: features (H/2, W/2, C), see `PixelUNetKernels`.
 
     The head is by far the largest map; here no more of it exists than a run of pixels takes.
@@ -167,10 +188,12 @@ def _read_features(first, last, features, kernels, bias, logs, top, shifts, resi
     cumulated, found = np.empty((CANDIDATES, RUN), np.float32), np.empty((4, RUN), np.float32)
     rectified = np.empty((RUN // 2, features.shape[2]), np.float32)
     head = np.empty((RUN // 2, 4 * CANDIDATES), np.float32)
+    kernels, bias = head_layer
+    top, width = candidates.top, candidates.logs.shape[2]
     for y in range(first, last):
         source, side = (y + top) // 2, (y + top) % 2
         for start in range(0, out.shape[2], RUN):
-            count = min(RUN, logs.shape[2] - start) // 2
+            count = min(RUN, width - start) // 2
             head_of(features[source], start // 2, kernels[side], rectified[:count], head[:count])
             for k in range(CANDIDATES):
                 for c in range(2):
@@ -178,42 +201,103 @@ def _read_features(first, last, features, kernels, bias, logs, top, shifts, resi
                     for i in range(count):
                         weights[k, 2 * i + c] = head[i, a] + bias[side, a]
                         depths[k, 2 * i + c] = head[i, b] + bias[side, b]
-            _distribution(weights, depths, cumulated, found, logs, y + top, start, shifts, residual, shares)
+            _distribution(weights, depths, cumulated, found, y + top, start, candidates)
             _write_run(weights, depths, cumulated, found, expected, y, start, out)
 
 
-def complete_mixture(
-    model: Selection,
-    convolutions: Callable[[Tensor], Tensor] | None,
-    sparse: Float,
-    image: NDArray[np.uint8],
-    scaling: str,
-    decoding: str,
-) -> tuple[Float, Float, Float, Float]:
-    """Sparse (h, w) metres and image (h, w, 3) of any size -> depth, foreground, background, sigma, each (h, w).
+def read_mixture(head: Float, candidates: Candidates, expected: bool, out: Float) -> None:
+    """Writes out (4, h, w), in as many threads as torch uses; see `_read_rows`. ValueError for maps of other shapes or
+    types."""
+    rows = _require_candidates(candidates, out)
+    height, width = candidates.logs.shape[1:]
+    require("head", head, (height // 2, width // 2, 4 * CHANNELS))
+    in_threads(_read_rows, rows, head, candidates, expected, out)
 
-    convolutions  (1, 40, H/2, W/2) -> (1, 84, H/2, W/2), an export of `model.network.at_half` or our kernels; None:
-                  that itself
-    scaling       of the colours, see `inputs.scale_rgb`
-    decoding      one of `completion.decoding.MIXTURE_DECODINGS`
+
+def read_mixture_of_features(features: Float, head: Head, candidates: Candidates, expected: bool, out: Float) -> None:
+    """`read_mixture` with the last layer `head`, of 2 CANDIDATES outputs, still to be applied to `features`."""
+    rows = _require_candidates(candidates, out)
+    height, width = candidates.logs.shape[1:]
+    require("features", features, (height // 2, width // 2, None))
+    require("head weights", head.weights, (2, features.shape[2], 4 * CANDIDATES))
+    require("head biases", head.bias, (2, 4 * CANDIDATES))
+    in_threads(_read_features, rows, features, head, candidates, expected, out)
+
+
+def _require_candidates(candidates: Candidates, out: Float) -> int:
+    """How many rows `out` has."""
+    _, rows, columns = require("maps", out, (4, None, None))
+    _, height, width = require("logs", candidates.logs, (3, None, None))
+    require("shares", candidates.shares, (3,))
+    if candidates.shifts.shape != (len(COLUMN_SHIFTS),):
+        raise ValueError(f"shifts: expected {len(COLUMN_SHIFTS)} columns, got shape {candidates.shifts.shape}")
+    if rows + candidates.top > height or columns > width or candidates.top < 0:
+        raise ValueError(f"maps: {rows} x {columns} from row {candidates.top} on exceed the logs' {height} x {width}")
+    return rows
+
+
+class _SelectionExecutor:
+    """What both executors of a selection network share; see `executors.Executor`."""
+
+    def __init__(self, model: Selection, spec: ModelSpec, decoding: str) -> None:
+        require_decoding(spec, decoding)
+        self.residual, self.scaling, self.decoding = np.float32(model.residual), spec.rgb, decoding
+        low, high = surface_shares(GAMMA)
+        self.shares = np.array((low, 0.5, high), np.float32)
+
+    def _candidates(self, inputs: UNetInputs) -> Candidates:
+        return Candidates(inputs.logs, inputs.top, np.array(COLUMN_SHIFTS), self.residual, self.shares)
+
+    def _maps(self, read: Float) -> FrameMaps:
+        depth, foreground, background, sigma = read
+        if self.decoding not in ("median", "expected"):
+            depth = fuse(foreground, background, sigma, self.decoding)
+        return FrameMaps(depth, foreground, background, sigma)
+
+
+class FusedSelection(_SelectionExecutor):
+    """Convolutions by torch or by an export, all around them fused.
+
+    at_half   (1, 40, H/2, W/2) -> (1, 84, H/2, W/2): `model.network.at_half` or what computes the same
+    decoding  one of `completion.decoding.MIXTURE_DECODINGS`, else ValueError
+    planes    the pixels of a channel lie together in what `at_half` is given, as exports take it
     """
-    own = isinstance(convolutions, PixelUNetKernels)
-    inputs = unet_inputs(sparse, image, scaling, planes=convolutions is not None and not own)
-    low, high = surface_shares(GAMMA)
-    shares = np.array((low, 0.5, high), np.float32)
-    out = np.empty((4, *sparse.shape), np.float32)
-    shifts, residual = np.array(COLUMN_SHIFTS), np.float32(model.residual)
-    common = inputs.logs, inputs.top, shifts, residual, shares, decoding == "expected", out
-    if isinstance(convolutions, PixelUNetKernels):
-        with convolutions.lock:
-            hidden = convolutions.before_head(inputs.features)
-            in_threads(_read_features, len(sparse), hidden, *convolutions.head, *common)
-    else:
-        run = convolutions or model.network.at_half
-        head = run(torch.from_numpy(inputs.features).permute(2, 0, 1)[None])
-        assert head.shape[1] == 4 * CHANNELS, head.shape
-        in_threads(_read_rows, len(sparse), head[0].float().permute(1, 2, 0).numpy(), *common)
-    depth, foreground, background, sigma = out
-    if decoding not in ("median", "expected"):
-        depth = fuse(foreground, background, sigma, decoding)
-    return depth, foreground, background, sigma
+
+    def __init__(
+        self,
+        model: Selection,
+        spec: ModelSpec,
+        decoding: str,
+        at_half: Callable[[Tensor], Tensor],
+        planes: bool = False,
+    ) -> None:
+        super().__init__(model, spec, decoding)
+        self.at_half, self.planes = at_half, planes
+
+    def run(self, sparse: Float, rgb: NDArray[np.uint8]) -> FrameMaps:
+        """See `Executor`."""
+        inputs = unet_inputs(sparse, rgb, self.scaling, self.planes)
+        with torch.inference_mode():
+            head = self.at_half(torch.from_numpy(inputs.features).permute(2, 0, 1)[None])[0].float()
+        out = np.empty((4, *sparse.shape), np.float32)
+        rows = head.permute(1, 2, 0).numpy()
+        read_mixture(rows, self._candidates(inputs), self.decoding == "expected", out)
+        return self._maps(out)
+
+
+class WinogradSelection(_SelectionExecutor):
+    """Our convolutions, with the network's weights at the time of this call; the last layer is fused too."""
+
+    def __init__(self, model: Selection, spec: ModelSpec, decoding: str) -> None:
+        super().__init__(model, spec, decoding)
+        self.kernels = PixelUNetKernels(model.network, outputs=2 * CANDIDATES)  # no decoding needs the scale
+
+    def run(self, sparse: Float, rgb: NDArray[np.uint8]) -> FrameMaps:
+        """See `Executor`."""
+        inputs = unet_inputs(sparse, rgb, self.scaling, planes=False)
+        out = np.empty((4, *sparse.shape), np.float32)
+        candidates, expected = self._candidates(inputs), self.decoding == "expected"
+        with self.kernels.lock:
+            features = self.kernels.before_head(inputs.features)
+            read_mixture_of_features(features, self.kernels.head, candidates, expected, out)
+        return self._maps(out)

@@ -25,7 +25,7 @@ class RingCoefficients(nn.Module):
     """`forward(sparse, rgb) -> (logits,)`: sparse (B, 1, H, W) metres, rgb (B, 3, H, W) standardised.
 
     logits (B, channels, H, W), to be trained by cross-entropy (Eq. 3.3). H and W must be multiples of 32.
-    `ring_coefficients_cpu` does the same faster for inference on the CPU.
+    `completion.cpu.ring_coefficients` does the same faster for inference on the CPU.
 
     width        features at half resolution; those of `Selection` at the same width can be a start
     count, size  see `Bins`; always with guard bins

@@ -86,7 +86,7 @@ class Selection(nn.Module):
 
     mixture (B, 21, H, W): ten logits, ten natural logs of depth in metres, one log scale; see `completion.mixture`.
     H and W must be multiples of 32. `network.at_half` is plain convolutions and can be exported; the rest is
-    arithmetic, which `selection_cpu` repeats faster for inference on the CPU.
+    arithmetic, which `completion.cpu.selection` repeats faster for inference on the CPU.
 
     width     features at half resolution (24: 0.73 M parameters)
     residual  largest relative correction of a measured candidate (0.1: about 10 %)

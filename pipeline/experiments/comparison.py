@@ -21,13 +21,13 @@ Depth = NDArray[np.float32]
 
 def predictions(recipe: Recipe, context: Context, paths: Sequence[Path]) -> list[Depth]:
     """Depth of every test frame by the recipe's network, trained first when that has not been done."""
-    from completion.infer import NetworkCompleter
+    from completion.infer import network_completer
 
     run = plan_run(recipe, context.budget, context.data, context.seed)
     do_run(run, context.out, context.data, context.say)
     spec = model_spec(recipe, context.budget)
     model = load_weights(spec, run.folder(context.out) / "last.safetensors")
-    completer = NetworkCompleter(model, spec, decoding=default_decoding(spec))
+    completer = network_completer(model, spec, decoding=default_decoding(spec))
     frames = [test_frame(recipe, path) for path in paths]
     return [completer.complete(frame.sparse[64], frame.image).depth for frame in frames]
 

@@ -76,8 +76,7 @@ def run(recipe: Recipe, context: Context) -> Outcome:
         from pipeline.experiments.comparison import audit
 
         return audit(context)
-    from completion.infer import NetworkCompleter
-    from pipeline.experiments.scoring import save_examples, score
+    from pipeline.experiments.scoring import completers, save_examples, score
 
     _check(recipe, context.budget)
     noisy = ("train", "test") if recipe.settings["target"] == "semi_dense" else ()
@@ -86,9 +85,9 @@ def run(recipe: Recipe, context: Context) -> Outcome:
     weights = _train(settings, _Samples(recipe, train_paths), context)
     model = load_weights(settings.model, weights)
     tests = [test_frame(recipe, path) for path in test_paths]
-    completer = NetworkCompleter(model, settings.model, decoding=default_decoding(settings.model))
-    save_examples(context.folder, completer, tests)
-    return score(completer, tests, settings.model, DIAGNOSED)
+    by_decoding = completers(model, settings.model, default_decoding(settings.model))
+    save_examples(context.folder, next(iter(by_decoding.values())), tests)
+    return score(by_decoding, tests, DIAGNOSED)
 
 
 def _check(recipe: Recipe, budget: CompletionBudget) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,9 +13,11 @@ from pipeline.experiments.frames import StoredFrame, write_npz
 from pipeline.experiments.runs import Outcome
 
 if TYPE_CHECKING:
-    from completion.infer import NetworkCompleter
+    from torch import nn
+
+    from completion.infer import Completer
     from completion.models import ModelSpec
-    from completion.types import CompletedDepth, DepthFrame
+    from completion.types import DepthFrame
 
 Depth = NDArray[np.float32]
 EXAMPLES = 2
@@ -40,33 +42,32 @@ def frame_scores(depth: Depth, target: Depth) -> dict[str, float]:
     }
 
 
-def decodings(completer: NetworkCompleter, spec: ModelSpec, frame: DepthFrame) -> dict[str, Depth]:
-    """Depth by read-out name; the first is the network's default."""
+def completers(model: nn.Module, spec: ModelSpec, first: str) -> dict[str, Completer]:
+    """One for each decoding of a network, by name; `first` comes first."""
     from completion.decoding import DECODINGS_OF
+    from completion.infer import network_completer
+
+    names = dict.fromkeys((first, *DECODINGS_OF[spec.output]))
+    return {name: network_completer(model, spec, decoding=name) for name in names}
+
+
+def decodings(by_decoding: Mapping[str, Completer], frame: DepthFrame) -> dict[str, Depth]:
+    """Depth by decoding, in the order of `completers`."""
     from completion.twin_surface import fuse
 
+    (first, completer), *others = by_decoding.items()
     completed = completer.complete(frame.sparse, frame.image)
-    first = completer.decoding
     found = {first: completed.depth}
-    for name in DECODINGS_OF[spec.output]:
-        if name in found:
-            continue
+    for name, other in others:
         if completed.foreground is not None and completed.background is not None and completed.sigma is not None:
             found[name] = fuse(completed.foreground, completed.background, completed.sigma, name)
         else:
-            found[name] = _other(completer, name)(frame).depth
+            found[name] = other.complete(frame.sparse, frame.image).depth
     return found
 
 
-def _other(completer: NetworkCompleter, decoding: str) -> Callable[[DepthFrame], CompletedDepth]:
-    from completion.infer import NetworkCompleter
-
-    other = NetworkCompleter(completer.model, completer.spec, decoding=decoding)
-    return lambda frame: other.complete(frame.sparse, frame.image)
-
-
-def score(completer: NetworkCompleter, frames: Sequence[StoredFrame], spec: ModelSpec, diagnosed: int) -> Outcome:
-    """Means over test frames.
+def score(by_decoding: Mapping[str, Completer], frames: Sequence[StoredFrame], diagnosed: int) -> Outcome:
+    """Means over test frames of the `completers` of a network.
 
     Names: "mae_mm" and so on for the default read-out against clean truth; "DECODING/mae_mm"; "semi_dense/mae_mm"
     against pseudo ground truth; "whole/", "edge/", "inside/" by region (Table 4.2); and, over the first `diagnosed`
@@ -86,7 +87,7 @@ def score(completer: NetworkCompleter, frames: Sequence[StoredFrame], spec: Mode
             values.append(value)
 
     for number, frame in enumerate(frames):
-        found = decodings(completer, spec, DepthFrame(frame.image, frame.sparse[64]))
+        found = decodings(by_decoding, DepthFrame(frame.image, frame.sparse[64]))
         for index, (name, depth) in enumerate(found.items()):
             scores = frame_scores(depth, frame.clean)
             add(name, scores, number)
@@ -99,12 +100,12 @@ def score(completer: NetworkCompleter, frames: Sequence[StoredFrame], spec: Mode
                         add(region, scores, number)
     numbers = {name: _mean(values) for name, values in columns.items()}
     some = [DepthFrame(frame.image, frame.sparse[64], frame.clean) for frame in frames[:diagnosed]]
-    numbers |= {f"alive/{name}": value for name, value in diagnose(completer, some).items()}
+    numbers |= {f"alive/{name}": value for name, value in diagnose(next(iter(by_decoding.values())), some).items()}
     kept = {name: values for name, values in columns.items() if name.rpartition("/")[2] in PER_FRAME}
     return Outcome(numbers, {name: _padded(values, len(frames)) for name, values in kept.items()})
 
 
-def save_examples(folder: Path, completer: NetworkCompleter, frames: Sequence[StoredFrame]) -> None:
+def save_examples(folder: Path, completer: Completer, frames: Sequence[StoredFrame]) -> None:
     """examples.npz: image, depth and truth of the first test frames, for figures."""
     parts: dict[str, NDArray[np.generic]] = {}
     for number, frame in enumerate(frames[:EXAMPLES]):

@@ -70,8 +70,8 @@ def test_a_cache_that_cannot_be_written_is_no_obstacle(tmp_path: Path, monkeypat
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     with pytest.warns(RuntimeWarning, match="not kept"):
         found = load_completer(saved(tmp_path, "twise"), backend="onnxruntime")
-    assert isinstance(found, NetworkCompleter)
-    assert found.convolutions is not None
+    frame = street(1, 64, 64)
+    assert found.complete(frame.sparse, frame.image).size == (64, 64)
 
 
 @pytest.mark.parametrize("architecture", sorted(OWN))
@@ -79,15 +79,22 @@ def test_auto_needs_no_further_package(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(backends, "find_spec", lambda name: None)
     found = load_completer(saved(tmp_path, architecture), backend="auto")
     assert isinstance(found, NetworkCompleter)
-    assert found.convolutions is not None
+    own = load_completer(saved(tmp_path, architecture), backend="numba")
+    assert isinstance(own, NetworkCompleter)
+    assert type(found.executor) is type(own.executor)
+    frame = street(1, 64, 64)
+    depths = [one.complete(frame.sparse, frame.image).depth for one in (found, own)]
+    np.testing.assert_array_equal(*depths)
 
 
 def test_auto_leaves_other_networks_to_torch(tmp_path: Path) -> None:
     spec = default_spec("depth_coefficients", count=8, size=10.0)
     path = save_checkpoint(tmp_path / "dc", build_model(spec), Card(spec, "all"))
-    found = load_completer(path, backend="auto")
-    assert isinstance(found, NetworkCompleter)
-    assert found.convolutions is None
+    frame = street(1, 64, 64)
+    found, plain = (
+        load_completer(path, backend=name).complete(frame.sparse, frame.image) for name in ("auto", "torch")
+    )
+    np.testing.assert_array_equal(found.depth, plain.depth)
     with pytest.raises(ValueError, match="depth_coefficients on cpu; use backend 'torch'"):
         load_completer(path, backend="onnxruntime")
 

@@ -10,7 +10,7 @@ import torch
 
 from completion.checkpoints import Card, CheckpointError, save_checkpoint
 from completion.decoding import decode_output
-from completion.infer import NetworkCompleter, load_completer
+from completion.infer import NetworkCompleter, load_completer, network_completer
 from completion.models import build_model, default_spec
 from completion.models.classical import ClassicalCompleter, linear_inverse_depth, morphological, nearest_depth
 from completion.twin_surface import DECODINGS, fuse
@@ -29,7 +29,7 @@ def completer(architecture: str, rows: int | None = None) -> NetworkCompleter:
     torch.manual_seed(0)
     spec = default_spec(architecture, **SMALL[architecture])
     decoding = {"depth": "depth", "coefficients": "peak", "twin": "fused", "mixture": "median"}[spec.output]
-    return NetworkCompleter(build_model(spec), spec, decoding=decoding, rows=rows)
+    return network_completer(build_model(spec), spec, decoding=decoding, rows=rows)
 
 
 @pytest.mark.parametrize("architecture", sorted(SMALL))
@@ -51,12 +51,13 @@ def test_monocular(architecture: str) -> None:
 def test_padding_is_at_the_top_and_right() -> None:
     """A frame of fitting size inside a larger, empty one: its bottom left corner completes alike."""
     frame = street(3, 64, 64)
-    found = completer("twise")
-    spec = found.spec
+    spec = default_spec("twise", **SMALL["twise"])
+    model = build_model(spec)
+    found = network_completer(model, spec)
     sparse = torch.zeros(1, 1, 64, 64)
     rgb = torch.zeros(1, 3, 64, 64)
     seen: dict[str, tuple[torch.Tensor, ...]] = {}
-    found.model.register_forward_hook(lambda _m, given, _o: seen.update(given=given))
+    model.register_forward_hook(lambda _m, given, _o: seen.update(given=given))
     found.complete(frame.sparse[3:, :60], frame.image[3:, :60])
     sparse[0, 0, 3:, :60] = torch.from_numpy(frame.sparse[3:, :60]) / spec.depth_unit
     assert torch.equal(seen["given"][0], sparse)
@@ -75,24 +76,13 @@ def test_bottom_rows_only() -> None:
     np.testing.assert_allclose(found.depth[32:], alone.depth, rtol=1e-5, atol=1e-5)
 
 
-def test_a_batch_is_its_frames() -> None:
-    frames = [street(i, 48, 64) for i in range(3)]
-    found = completer("selection")
-    together = found.complete_batch(frames)
-    for one, frame in zip(together, frames):
-        np.testing.assert_allclose(one.depth, found.complete(frame.sparse, frame.image).depth, rtol=1e-4, atol=1e-4)
-    assert found.complete_batch([]) == []
-    with pytest.raises(ValueError, match="one image size"):
-        found.complete_batch([frames[0], street(0, 32, 64)])
-
-
 def test_loading_by_path(tmp_path: Path) -> None:
     spec = default_spec("selection", width=8)
     model = build_model(spec)
     path = save_checkpoint(tmp_path / "net", model, Card(spec, "hard"))
     frame = street(6, 64, 96)
     found = load_completer(str(path)).complete(frame.sparse, frame.image)
-    expected = NetworkCompleter(model, spec, decoding="hard").complete(frame.sparse, frame.image)
+    expected = network_completer(model, spec, decoding="hard").complete(frame.sparse, frame.image)
     np.testing.assert_array_equal(found.depth, expected.depth)
     assert found.sigma is not None
     assert found.foreground is not None

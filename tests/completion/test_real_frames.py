@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from completion.infer import NetworkCompleter
+from completion.infer import network_completer
 from completion.metrics import depth_metrics
 from completion.models import build_model, default_spec
 from completion.models.classical import linear_inverse_depth, nearest_depth
@@ -31,7 +31,7 @@ def test_a_network_completes_a_real_frame_at_full_size(kitti_object: Path) -> No
     frame = open_dataset("kitti_object", kitti_object)["000003"]
     torch.manual_seed(0)
     spec = default_spec("selection", width=8)
-    completed = NetworkCompleter(build_model(spec), spec, decoding="hard").complete(frame.sparse_depth, frame.image)
+    completed = network_completer(build_model(spec), spec, decoding="hard").complete(frame.sparse_depth, frame.image)
     assert completed.size == frame.image.shape[:2]
     measured = frame.sparse_depth > 0
     assert np.median(np.abs(completed.depth - frame.sparse_depth)[measured]) < 1.0  # untrained, it already interpolates

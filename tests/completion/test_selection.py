@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch.nn import functional as F
 
+from completion.backends import torch_executor
 from completion.checkpoints import Card, load_checkpoint, save_checkpoint
-from completion.cpu.selection import complete_mixture
 from completion.decoding import MIXTURE_DECODINGS, decode_output
 from completion.inputs import scale_rgb
 from completion.mixture import negative_log_likelihood, twin_surfaces
@@ -155,8 +155,9 @@ def test_fused_pass_agrees_with_torch(decoding: str, threads: int) -> None:
             with torch.inference_mode():
                 (mixture,) = model(F.pad(sparse, (0, right, top, 0)), F.pad(rgb, (0, right, top, 0), mode="replicate"))
                 expected = decode_output(mixture[:, :, top:, :width], spec, decoding)
-                found = complete_mixture(model, None, frame.sparse, frame.image, "standardised", decoding)
+                found = torch_executor(model, spec, "cpu", decoding).run(frame.sparse, frame.image)
             for one, other in zip(found, expected):
+                assert one is not None
                 assert other is not None
                 np.testing.assert_allclose(one, other[0].numpy(), rtol=1e-5, atol=1e-6)
     finally:
@@ -167,7 +168,8 @@ def test_fused_pass_survives_extreme_outputs() -> None:
     """Logits and corrections far beyond float32's exponential."""
     model = small(4, head=300.0)
     frame = street(7, 64, 96)
-    with torch.inference_mode():
-        found = complete_mixture(model, None, frame.sparse, frame.image, "standardised", "expected")
-    assert all(np.isfinite(part).all() for part in found)
-    assert found[3].max() <= 1
+    spec = default_spec("selection", width=8)
+    found = torch_executor(model, spec, "cpu", "expected").run(frame.sparse, frame.image)
+    assert found.sigma is not None
+    assert all(part is not None and np.isfinite(part).all() for part in found)
+    assert found.sigma.max() <= 1

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from completion.depth_coefficients import decode_logits
-from completion.infer import NetworkCompleter
+from completion.infer import network_completer
 from completion.models import ModelSpec, build_model, default_spec
-from completion.tiles import TiledCompleter, tile_starts
+from completion.tiles import tile_starts, tiled_completer
 from tests.completion.scenes import street
 
 
@@ -30,7 +30,7 @@ def test_logits_are_summed_where_tiles_overlap(network: tuple[torch.nn.Module, M
     """Width 80 in tiles of 48: columns 0..47 and 32..79; 32..47 belong to both."""
     model, spec = network
     frame = street(1, 32, 80)
-    found = TiledCompleter(model, spec, rows=None, decoding="all", tile_width=48).complete(frame.sparse, frame.image)
+    found = tiled_completer(model, spec, rows=None, decoding="all", tile_width=48).complete(frame.sparse, frame.image)
     sparse = torch.from_numpy(frame.sparse)[None, None]
     rgb = torch.from_numpy(frame.image).permute(2, 0, 1)[None].float() / 255
     with torch.inference_mode():
@@ -41,8 +41,8 @@ def test_logits_are_summed_where_tiles_overlap(network: tuple[torch.nn.Module, M
 
 def test_one_wide_tile_is_the_whole_image(network: tuple[torch.nn.Module, ModelSpec]) -> None:
     frame = street(2, 40, 60)
-    tiled = TiledCompleter(*network, rows=32, tile_width=60).complete(frame.sparse, frame.image)
-    whole = NetworkCompleter(*network, decoding="peak", rows=32).complete(frame.sparse, frame.image)
+    tiled = tiled_completer(*network, rows=32, tile_width=60).complete(frame.sparse, frame.image)
+    whole = network_completer(*network, decoding="peak", rows=32).complete(frame.sparse, frame.image)
     np.testing.assert_array_equal(tiled.depth, whole.depth)
     assert tiled.depth[:8].max() == 0
 
@@ -50,6 +50,6 @@ def test_one_wide_tile_is_the_whole_image(network: tuple[torch.nn.Module, ModelS
 def test_other_networks_are_refused(network: tuple[torch.nn.Module, ModelSpec]) -> None:
     spec = default_spec("twise", channels=4)
     with pytest.raises(ValueError, match="output 'coefficients', twise has 'twin'"):
-        TiledCompleter(build_model(spec), spec)
+        tiled_completer(build_model(spec), spec)
     with pytest.raises(ValueError, match="tile_width"):
-        TiledCompleter(*network, tile_width=0)
+        tiled_completer(*network, tile_width=0)
