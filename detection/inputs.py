@@ -39,7 +39,7 @@ class CameraCloud:
 def camera_cloud(frame: PointFrame) -> CameraCloud:
     """Points inside the image (of this frame's own size), in front of the camera and within `AREA`."""
     xyz = _camera_xyz(frame)
-    inside = _in_image(frame, xyz)
+    inside = openpcdet_field_of_view(xyz, frame.P2, frame.image_size)
     for axis, (low, high) in enumerate(AREA):
         inside &= (xyz[:, axis] >= low) & (xyz[:, axis] <= high)
     return CameraCloud(xyz[inside].astype(np.float32), frame.points[inside, 3:])
@@ -176,23 +176,28 @@ def mirrored(cloud: CameraCloud) -> CameraCloud:
     return CameraCloud(cloud.xyz * np.array([-1, 1, 1], dtype=np.float32), cloud.columns)
 
 
-def in_image(frame: PointFrame) -> NDArray[np.bool_]:
-    """(N,) whether a point is in front of the camera and inside the image."""
-    return _in_image(frame, _camera_xyz(frame))
+def in_view_openpcdet(frame: PointFrame) -> NDArray[np.bool_]:
+    """(N,) whether OpenPCDet and PointRCNN would keep a point of the frame: see `openpcdet_field_of_view`."""
+    return openpcdet_field_of_view(_camera_xyz(frame), frame.P2, frame.image_size)
 
 
 def _camera_xyz(frame: PointFrame) -> Array:
     return frame.points[:, :3].astype(np.float64) @ frame.T_cam_velo[:3, :3].T + frame.T_cam_velo[:3, 3]
 
 
-def _in_image(frame: PointFrame, xyz: Array) -> NDArray[np.bool_]:
-    """`in_image` with the points (N, 3) in the camera frame."""
-    projected = xyz @ frame.P2[:, :3].T + frame.P2[:, 3]
-    height, width = frame.image_size
-    # PointRCNN and OpenPCDet divide by z of the rectified frame, not by the homogeneous coordinate.
+def openpcdet_field_of_view(xyz: Array, P2: Array, image_size: tuple[int, int]) -> NDArray[np.bool_]:
+    """(N,) True for points (N, 3) of the rectified camera frame, metres, that OpenPCDet's and PointRCNN's loaders keep.
+
+    image_size  (height, width) in pixels
+    This is the border the networks were trained behind (OpenPCDet's `get_fov_flag`, PointRCNN's `get_valid_flag`): u
+    and v are not rounded, 0 <= u < width, 0 <= v < height, and are divided by z of the rectified frame instead of the
+    homogeneous coordinate (2.7 mm apart in KITTI); the depth is the latter less P2[2, 3] and may be 0.
+    """
+    projected = xyz @ P2[:, :3].T + P2[:, 3]
+    height, width = image_size
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = projected[:, 0] / xyz[:, 2], projected[:, 1] / xyz[:, 2]
-        return (projected[:, 2] - frame.P2[2, 3] >= 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        return (projected[:, 2] - P2[2, 3] >= 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
 
 
 # OpenPCDet's POINT_CLOUD_RANGE of x and y; its mask leaves z alone.
@@ -207,7 +212,7 @@ def lidar_input(frame: PointFrame, count: int, rng: np.random.Generator) -> NDAr
     points = frame.points[:, :4]
     if points.shape[1] < 4:
         raise ValueError(f"{frame.id}: expected points x y z intensity, got {points.shape[1]} columns")
-    keep = in_image(frame)
+    keep = in_view_openpcdet(frame)
     for axis, (low, high) in enumerate(LIDAR_AREA):
         keep &= (points[:, axis] >= low) & (points[:, axis] <= high)
     points = points[keep]

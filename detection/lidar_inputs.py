@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detection.boxes import from_lidar, to_lidar
-from detection.inputs import LIDAR_AREA, CameraCloud, ground_height, in_image, point_features
+from detection.inputs import LIDAR_AREA, CameraCloud, ground_height, in_view_openpcdet, point_features
 from detection.types import Boxes3D, PointFrame
 
 Array = NDArray[np.float64]
@@ -24,7 +24,7 @@ _T_AXES_VELO = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0,
 
 def camera_axes_cloud(frame: PointFrame) -> CameraCloud:
     """Points inside the image and `LIDAR_AREA` (x and y; z is free) in turned axes, in the order of the frame."""
-    keep = in_image(frame)
+    keep = in_view_openpcdet(frame)
     for axis, (low, high) in enumerate(LIDAR_AREA):
         keep &= (frame.points[:, axis] >= low) & (frame.points[:, axis] <= high)
     points = frame.points[keep]

@@ -19,6 +19,7 @@ from detection.ops.pooling import points_in_boxes
 from pipeline.base.errors import UsageError
 from pipeline.benchmark.visibility import visible_points
 from pipeline.data import Dataset, Frame
+from pipeline.geometry.in_view import lidar_pixels
 from pipeline.geometry.rings import split_rings
 from pipeline.semantics.sources import SemanticsSource
 
@@ -81,7 +82,7 @@ def count_points(frame: Frame, semantics: NDArray[np.uint8]) -> dict[str, PointC
     points = frame.points
     seen = points[visible_points(points, split_rings(points), frame.calibration, frame.image_size)]
     camera = frame.calibration.velo_to_cam(seen)
-    column, row = np.rint(frame.calibration.cam_to_image(camera)[0]).astype(int).T
+    row, column = np.divmod(lidar_pixels(seen, frame.calibration, frame.image_size), frame.image_size[1])
     classes, left_out = semantics[row, column], _in_regions(column, row, frame.labels)
     counts = {}
     for group, (types, train_ids) in GROUPS.items():

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
 from pipeline.geometry.calibration import Calibration
+from pipeline.geometry.in_view import MIN_DEPTH, pixel_of, pixels_and_depth, value_at
 
 Array = NDArray[np.float64]
 
@@ -77,17 +78,10 @@ def visible_points(
 
     Hidden = more than max(1 m, 5 %) behind the nearest surface within one pixel.
     """
-    height, width = image_size
     surface = minimum_filter(surface_depth(points, ring, calibration, image_size), size=3, mode="nearest")
-    cam = calibration.velo_to_cam(points)
-    pixels, depth = calibration.cam_to_image(cam)
-    front = depth > 0.5
-    column, row = np.zeros(len(points), dtype=int), np.zeros(len(points), dtype=int)
-    column[front], row[front] = np.rint(pixels[front]).astype(int).T
-    inside = front & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    nearest = np.full(len(points), -np.inf)
-    nearest[inside] = surface[row[inside], column[inside]]
-    return inside & (depth <= nearest + np.maximum(1.0, 0.05 * nearest))
+    pixels, depth = pixels_and_depth(points, calibration, image_size)
+    nearest = value_at(pixels, surface)
+    return (pixels >= 0) & (depth <= nearest + np.maximum(1.0, 0.05 * nearest))
 
 
 def _neighbours_in_ring(azimuth: Array, ring: NDArray[np.integer], ranges: Array) -> NDArray[np.bool_]:
@@ -140,16 +134,13 @@ def _splat_links(buffer: Array, start: Array, end: Array, P2: Array, samples: in
 @njit(cache=True)
 def _splat(buffer, start, end, P2, samples):  # type: ignore[no-untyped-def]
     height, width = buffer.shape
+    flat = buffer.reshape(-1)
     for i in range(len(start)):
         for s in range(samples):
             t = s / (samples - 1)
             x = (1 - t) * start[i, 0] + t * end[i, 0]
             y = (1 - t) * start[i, 1] + t * end[i, 1]
             z = (1 - t) * start[i, 2] + t * end[i, 2]
-            if z <= 0.5:
-                continue
-            w = P2[2, 0] * x + P2[2, 1] * y + P2[2, 2] * z + P2[2, 3]
-            u = round((P2[0, 0] * x + P2[0, 1] * y + P2[0, 2] * z + P2[0, 3]) / w)
-            v = round((P2[1, 0] * x + P2[1, 1] * y + P2[1, 2] * z + P2[1, 3]) / w)
-            if 0 <= u < width and 0 <= v < height and z < buffer[int(v), int(u)]:
-                buffer[int(v), int(u)] = z
+            pixel = pixel_of(P2, x, y, z, height, width) if z > MIN_DEPTH else -1
+            if pixel >= 0 and z < flat[pixel]:
+                flat[pixel] = z

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.base.errors import DataError
 from pipeline.check.faults import Finding
 from pipeline.data.images import read_unchanged
+from pipeline.geometry.back_project import PixelRays
 from pipeline.geometry.calibration import Calibration
 
 FAR_CODE = 65535
@@ -133,10 +134,10 @@ def check_depth(
 
 def _is_range(depth: Depth, lidar: Depth, calibration: Calibration, position: Position, given: float) -> bool:
     """True when dividing by the length of the pixel's ray makes the map fit clearly better."""
-    rows = (np.arange(depth.shape[0]) + position.top - calibration.P2[1, 2]) / calibration.P2[1, 1]
-    columns = (np.arange(depth.shape[1]) + position.left - calibration.P2[0, 2]) / calibration.P2[0, 0]
-    rays = np.sqrt(1 + rows[:, None] ** 2 + columns[None, :] ** 2)
-    as_range = agreement((depth / rays).astype(np.float32), lidar, position, _TIGHT)
+    rows, columns = (np.arange(size) for size in depth.shape)
+    u, v = np.meshgrid(columns + position.left, rows + position.top)
+    rays = PixelRays.of(calibration).through(u, v)
+    as_range = agreement((depth / np.linalg.norm(rays, axis=-1)).astype(np.float32), lidar, position, _TIGHT)
     return as_range is not None and as_range > given + 2 * _BETTER and as_range > 0.5
 
 

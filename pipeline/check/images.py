@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.calibration import Calibration
+from pipeline.geometry.project import project_points
 
 # Neighbouring frames that are tried when image and cloud do not fit.
 OFFSETS = (-2, -1, 1, 2)
@@ -83,14 +84,9 @@ def _depth_steps(
     """Largest ratio of the nearest returns within 3 x 3 cells, and the cells with returns."""
     import cv2
 
-    pixels, depth = calibration.cam_to_image(calibration.velo_to_cam(points))
-    front = depth > 1
-    u, v = (pixels[front] / _CELL).T
-    inside = (u >= 0) & (u < size[1]) & (v >= 0) & (v < size[0])
-    flat = v[inside].astype(np.int64) * size[1] + u[inside].astype(np.int64)
-    nearest = np.full(size[0] * size[1], np.inf)
-    np.minimum.at(nearest, flat, depth[front][inside])
-    nearest = nearest.reshape(size)
+    whole = project_points(points, calibration, (size[0] * _CELL, size[1] * _CELL))
+    cells = np.where(whole > 0, whole, np.inf).reshape(size[0], _CELL, size[1], _CELL)
+    nearest = cells.min(axis=(1, 3))
     seen = np.isfinite(nearest)
     log = np.log(np.where(seen, nearest, 1.0)).astype(np.float32)
     kernel = np.ones((3, 3), np.uint8)

@@ -8,11 +8,10 @@ depth is copied, so that the sparse map agrees with the dense one exactly.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.geometry.back_project import back_project, pixels_to_velo
 from pipeline.geometry.calibration import Calibration
 
 TOP_ELEVATION = np.deg2rad(2.0)
@@ -55,21 +54,5 @@ def sample_like_lidar(
 
 def depth_points(depth: NDArray[np.float32], calibration: Calibration) -> NDArray[np.float32]:
     """(N, 4) x y z intensity (0) in the LiDAR frame of the pixels with a value, row by row."""
-    v, u = np.nonzero(depth)
-    xyz = pixels_to_velo(u, v, depth[v, u].astype(np.float64), calibration)
-    return np.column_stack([xyz, np.zeros(len(xyz))]).astype(np.float32)
-
-
-def pixels_to_velo(
-    u: NDArray[Any], v: NDArray[Any], depth: NDArray[np.float64], calibration: Calibration
-) -> NDArray[np.float64]:
-    """(N,) columns, rows and depths (z of rectified camera 0, metres) -> (N, 3) points in the LiDAR frame.
-
-    The exact inverse of P2, with its third row: KITTI's P2 has 2.7 mm in the corner, which moves a near pixel by a
-    third of a pixel when it is left out.
-    """
-    P2 = calibration.P2
-    w = P2[2, 2] * depth + P2[2, 3]
-    x = (u * w - P2[0, 2] * depth - P2[0, 3]) / P2[0, 0]
-    y = (v * w - P2[1, 2] * depth - P2[1, 3]) / P2[1, 1]
-    return calibration.cam_to_velo(np.column_stack([x, y, depth]))
+    xyz = back_project(depth, calibration, depth > 0).points
+    return np.column_stack([xyz, np.zeros(len(xyz), np.float32)])

@@ -23,16 +23,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from completion.types import CompletedDepth
+from pipeline.base.paths import RunFolder
+from pipeline.data.depth_folder import read_depth_folder
 from pipeline.geometry.back_project import back_project
 from pipeline.geometry.calibration import Calibration
 from pipeline.geometry.clouds import DenseCloud
-from pipeline.pointcloud.depth_source import read_completed
 from pipeline.pointcloud.grid_sampling import grid_sampling
 from pipeline.pointcloud.presets import AugmentSettings
+from pipeline.pointcloud.pseudo_sigma import pseudo_sigma
 from pipeline.pointcloud.radius_gather import radius_gather
 from pipeline.pointcloud.semantic_mask import object_score, semantic_mask
 from pipeline.pointcloud.sigma_filter import sigma_filter
 from pipeline.pointcloud.taxonomy import CLEAN, LABELS, NOISE_INBET, UNKNOWN, Taxonomy, label_noise
+from pipeline.run_folder.frame_outputs import FrameOutputs
 
 LOWS = (0.01, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)
 GAPS = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
@@ -195,6 +198,19 @@ def sweep_figure(sweep: SigmaSweep, settings: AugmentSettings, path: Path) -> Pa
         figure.colorbar(image, ax=axis)
     figure.savefig(path, dpi=110)
     return path
+
+
+def read_completed(folder: Path, frame_id: str, image_size: tuple[int, int]) -> CompletedDepth:
+    """The completed depth of one frame from a run folder (it has a folder depth/) or a folder of PNGs.
+
+    Depth without surfaces gets those of `pseudo_sigma`. Raises DataError when a file is missing or damaged.
+    """
+    run = RunFolder(folder)
+    if run.depth(frame_id).parent.is_dir():
+        completed = FrameOutputs(run, frame_id).read_completed()
+    else:
+        completed = read_depth_folder(folder, frame_id, image_size)
+    return completed if completed.has_surfaces else pseudo_sigma(completed.depth)
 
 
 def dataset_frames(data: Path, completed: Path, selection: str | None) -> Iterable[StudyFrame]:

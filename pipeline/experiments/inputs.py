@@ -160,13 +160,12 @@ def make_input(
 
 
 def _in_area(frame: Frame, points: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(N,) inside the image and the detectors' area with a margin."""
-    from detection.inputs import AREA, in_image
-    from detection.types import PointFrame
+    """(N,) inside the detectors' border: their field of view, and their area with a margin."""
+    from detection.inputs import AREA, openpcdet_field_of_view
 
-    camera = frame.calibration
-    inside = in_image(PointFrame(points[:, :3], camera.T_cam_velo, camera.P2, frame.image_size, frame.id))
-    for values, (low, high) in zip(camera.velo_to_cam(points).T, AREA):
+    camera = frame.calibration.velo_to_cam(points)
+    inside = openpcdet_field_of_view(camera, frame.calibration.P2, frame.image_size)
+    for values, (low, high) in zip(camera.T, AREA):
         inside &= (values >= low - MARGIN) & (values <= high + MARGIN)
     return inside
 

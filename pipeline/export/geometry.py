@@ -1,4 +1,4 @@
-"""Pixels of depth maps; LiDAR points in the image and in boxes."""
+"""Labelled boxes in the LiDAR frame, and the points inside."""
 
 from __future__ import annotations
 
@@ -10,20 +10,6 @@ from detection.types import Boxes3D
 from pipeline.geometry.calibration import Calibration
 
 Array = NDArray[np.float64]
-
-
-def depth_pixels(depth: NDArray[np.float32]) -> tuple[Array, Array, Array]:
-    """(u, v, depth) of the pixels with a value, row by row."""
-    v, u = np.nonzero(depth)
-    return u.astype(np.float64), v.astype(np.float64), depth[v, u].astype(np.float64)
-
-
-def in_image(points: NDArray[np.floating], calibration: Calibration, window: tuple[int, int]) -> NDArray[np.bool_]:
-    """(N,) True for LiDAR points in front of the camera that project into a window (height, width) from the corner."""
-    pixels, depth = calibration.cam_to_image(calibration.velo_to_cam(points))
-    height, width = window
-    inside = (pixels[:, 0] >= 0) & (pixels[:, 0] < width) & (pixels[:, 1] >= 0) & (pixels[:, 1] < height)
-    return np.asarray(inside & (depth > 0))
 
 
 def boxes_in_lidar(boxes: Boxes3D, calibration: Calibration) -> Array:

@@ -16,11 +16,12 @@ import numpy as np
 from detection.kitti_format import KittiObject, boxes_of
 from pipeline.data.kitti_object import write_velodyne
 from pipeline.export.disk_buffer import DiskBuffer, write_streamed
-from pipeline.export.geometry import boxes_in_lidar, in_image, points_in_box
+from pipeline.export.geometry import boxes_in_lidar, points_in_box
 from pipeline.export.kitti_tree import care_first, square, write_kitti_frame
 from pipeline.export.pickles import item_opcodes, write_dict_of_lists
 from pipeline.export.record import Options, Record
 from pipeline.export.source import ExportFrame
+from pipeline.geometry.reference_in_view import in_view_mmdet3d
 
 CATEGORIES = {
     "Pedestrian": 0,
@@ -38,7 +39,7 @@ INFOS = "infos"
 def write_frame(item: ExportFrame, out: Path, options: Options) -> Record:
     """One frame: its KITTI files, the points in the image as velodyne_reduced, and its entry of data_list."""
     count = write_kitti_frame(item, out / "training", options)
-    visible = item.points[in_image(item.points, item.frame.calibration, item.frame.image_size)]
+    visible = item.points[in_view_mmdet3d(item.points, item.frame.calibration, item.frame.image_size)]
     write_velodyne(out / "training" / "velodyne_reduced" / f"{item.name}.bin", visible)
     info = frame_info(item, visible)
     counts = {"points": count, "boxes": len(info.get("instances", ()))}

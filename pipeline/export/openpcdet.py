@@ -21,11 +21,12 @@ from detection.boxes import wrap_angle
 from detection.kitti_format import KittiObject, boxes_of
 from pipeline.data.kitti_object import write_velodyne
 from pipeline.export.disk_buffer import DiskBuffer, write_streamed
-from pipeline.export.geometry import boxes_in_lidar, in_image, points_in_box
+from pipeline.export.geometry import boxes_in_lidar, points_in_box
 from pipeline.export.kitti_tree import care_first, square, write_kitti_frame
 from pipeline.export.pickles import item_opcodes, write_dict_of_lists, write_list
 from pipeline.export.record import Options, Record
 from pipeline.export.source import ExportFrame
+from pipeline.geometry.reference_in_view import in_view_openpcdet
 
 INFOS, DATABASE = "infos", "database/"
 
@@ -65,7 +66,7 @@ def frame_annotations(item: ExportFrame) -> dict[str, Any]:
     rows = boxes_of(objects).values
     lidar = boxes_in_lidar(boxes_of(cared), item.frame.calibration)
     inside = np.full(len(objects), -1, dtype=np.int32)
-    visible = item.points[in_image(item.points, item.frame.calibration, item.frame.image_size)]
+    visible = item.points[in_view_openpcdet(item.points, item.frame.calibration, item.frame.image_size)]
     inside[: len(cared)] = [int(points_in_box(visible, box).sum()) for box in lidar]
     return {
         "name": np.array([o.type for o in objects]),

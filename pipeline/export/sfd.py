@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from auglidar_base.atomic import write_bytes
 from pipeline.data.depth_png import depth_png_bytes
-from pipeline.data.lidar_like import pixels_to_velo
-from pipeline.export.geometry import depth_pixels
 from pipeline.export.kitti_tree import write_kitti_frame
 from pipeline.export.record import Options, Record
 from pipeline.export.source import ExportFrame
+from pipeline.geometry.back_project import depth_pixels, pixels_to_velo
 
 CROP = (352, 1216)
 PREDICTED_ROWS = 256

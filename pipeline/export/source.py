@@ -18,6 +18,7 @@ from pipeline.base.paths import RunFolder
 from pipeline.data.cloud_files import Cloud
 from pipeline.data.frame import Frame
 from pipeline.data.kitti_object import read_labels
+from pipeline.geometry.in_view import lidar_pixels, value_at
 from pipeline.run_folder.frame_outputs import FrameOutputs, read_npz, read_run_file
 
 BASE_COLUMNS = ("x", "y", "z", "intensity", "source")
@@ -75,15 +76,9 @@ class ExportFrame:
         names = tuple(name for name in ("sigma", "foreground", "background") if name not in cloud.columns)
         if self.run is None or not self.run.twin(self.frame.id).is_file() or not names:
             return cloud
-        pixels, depth = self.frame.calibration.cam_to_image(self.frame.calibration.velo_to_cam(cloud.values))
-        height, width = self.completed.size
-        front = depth > 0
-        u, v = np.rint(np.where(front[:, None], pixels, -1)).astype(np.int64).T
-        inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-        added = np.zeros((len(cloud.values), len(names)), np.float32)
-        for index, name in enumerate(names):
-            added[inside, index] = getattr(self.completed, name)[v[inside], u[inside]]
-        return Cloud(np.column_stack([cloud.values, added]), cloud.columns + names)
+        pixels = lidar_pixels(cloud.values, self.frame.calibration, self.completed.size)
+        added = [value_at(pixels, getattr(self.completed, name)) for name in names]
+        return Cloud(np.column_stack([cloud.values, *added]), cloud.columns + names)
 
     @property
     def points(self) -> NDArray[np.float32]:

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from auglidar_base.atomic import write_bytes
-from pipeline.data.lidar_like import pixels_to_velo
-from pipeline.export.geometry import depth_pixels, in_image
 from pipeline.export.kitti_tree import write_kitti_frame
 from pipeline.export.record import Options, Record
 from pipeline.export.source import ExportFrame
+from pipeline.geometry.back_project import depth_pixels, pixels_to_velo
+from pipeline.geometry.reference_in_view import in_view_openpcdet
 
 WINDOW = (352, 1216)
 CELL = 0.002
@@ -48,7 +48,7 @@ def velodyne_depth(item: ExportFrame, options: Options) -> NDArray[np.float32]:
     """(N, 8) float32 rows of a frame, measured points first."""
     window = WINDOW if "window352" in options.compat else item.frame.image_size
     points = item.frame.points if item.frame.has("points") else np.zeros((0, 4), np.float32)
-    points = points[in_image(points, item.frame.calibration, window)]
+    points = points[in_view_openpcdet(points, item.frame.calibration, window)]
     nothing = np.zeros((len(points), 3), np.float32)
     flag = np.full(len(points), MEASURED, np.float32)
     measured = np.column_stack([points[:, :3], points[:, 3] * np.float32(INTENSITY_SCALE), nothing, flag])

@@ -38,7 +38,7 @@ def back_project_and_sample(
     Raises DataError for NaN, infinite or negative depth and ValueError for points too far for the cell size.
     """
     depth, kept = usable_pixels(depth, keep)
-    rays = PixelRays.of(calibration, (depth.shape[0], depth.shape[1]))
+    rays = PixelRays.of(calibration)
     builder = CellBuilder(1.0 / grid.size, "grid sampling")
     builder.check(rays.reach(depth))
     blocks = []

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from detection.kitti_format import KittiObject, boxes_of
 from pipeline.geometry.calibration import Calibration
+from pipeline.geometry.in_view import in_view
 from pipeline.geometry.project import project_points
 from pipeline.geometry.rings import split_rings
 
@@ -61,7 +62,7 @@ def describe(
     size = (image.shape[0], image.shape[1])
     camera = calibration.velo_to_cam(points)
     pixels, depth = calibration.cam_to_image(camera)
-    seen = (depth > 0.5) & (pixels >= 0).all(axis=1) & (pixels[:, 0] < size[1]) & (pixels[:, 1] < size[0])
+    seen = in_view(points, calibration, size)
     sparse = project_points(points, calibration, size)
     values = sparse[sparse > 0]
     grey = image.astype(np.float32).mean(axis=2)

@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.frame import Frame
+from pipeline.data.lidar_like import depth_points
 from pipeline.run_folder.frame_outputs import FrameOutputs
-
-if TYPE_CHECKING:
-    pass
 
 
 def lidar_of(frame: Frame) -> NDArray[np.float32]:
     """(N, 4) LiDAR points; where sparse depth is stored instead (Virtual KITTI 2), its pixels back-projected."""
     if frame.has("points"):
         return frame.points
-    from pipeline.geometry.back_project import back_project
-
-    sparse = frame.sparse_depth
-    points = back_project(sparse, frame.calibration, sparse > 0).points
-    return np.column_stack([points, np.zeros(len(points))]).astype(np.float32)
+    return depth_points(frame.sparse_depth, frame.calibration)
 
 
 def lidar_parts(frame: Frame) -> tuple[str, ...]:

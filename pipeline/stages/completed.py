@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.base.errors import DataError
-from pipeline.data.depth_png import read_depth_png
+from pipeline.data.depth_folder import read_depth_folder
 from pipeline.data.frame import Frame
 from pipeline.run_folder.frame_outputs import FrameOutputs
 
@@ -16,20 +14,10 @@ if TYPE_CHECKING:
 
 
 def completed_depth(depth_from: str | None, frame: Frame, files: FrameOutputs) -> CompletedDepth:
-    """Completed depth of this run, or of the folder `depth_from`."""
-    from completion.types import CompletedDepth
-
+    """Completed depth of this run, or of the folder `depth_from`. Raises DataError for an unusable file."""
     if depth_from is None:
         return files.read_completed()
-    from pipeline.pointcloud.depth_source import placed_bottom_centre
-
-    path = Path(depth_from) / f"{frame.id}.png"
-    depth = read_depth_png(path)
-    if not depth.any():
-        raise DataError(path, "a depth map with values", "no pixel has a value")
-    if depth.shape != tuple(frame.image_size):
-        depth = placed_bottom_centre(depth, frame.image_size, path)
-    return CompletedDepth(depth)
+    return read_depth_folder(depth_from, frame.id, frame.image_size)
 
 
 def with_sigma(completed: CompletedDepth, settings: AugmentSettings) -> CompletedDepth:

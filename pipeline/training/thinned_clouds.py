@@ -55,7 +55,8 @@ def thinned_cloud(
 class ThinnedClouds:
     """Labelled clouds with 64, 32, 16 ... rows, as `detection.train` reads them.
 
-    What lies in the camera's view is kept in OUT/training_clouds, so a frame is thinned, completed and augmented once.
+    What the detectors' border lets through is kept in OUT/training_clouds, so a frame is thinned, completed and
+    augmented once.
     """
 
     dataset: Dataset
@@ -84,14 +85,14 @@ class ThinnedClouds:
         if path.is_file():
             kept: NDArray[np.float32] = np.load(path, allow_pickle=False)
             return kept
-        from detection.inputs import in_image
+        from detection.inputs import in_view_openpcdet
         from detection.types import PointFrame
 
         settings, completer = self._tools()
         points = thinned_cloud(frame, step, settings, completer, self.config.seed)
         camera = frame.calibration
         seen = PointFrame(points, camera.T_cam_velo, camera.P2, frame.image_size, frame.id)
-        points = points[in_image(seen)]
+        points = points[in_view_openpcdet(seen)]
         content = io.BytesIO()
         np.save(content, points, allow_pickle=False)
         write_bytes(path, content.getvalue())

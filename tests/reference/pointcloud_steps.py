@@ -12,17 +12,17 @@ from pipeline.geometry.calibration import Calibration
 
 
 def back_project(depth: NDArray, calibration: Calibration, keep: NDArray) -> tuple[NDArray, NDArray]:
-    """Points (N, 3) float32 and pixels (N,) by one loop over the image."""
-    (fu, _, cu, p0), (_, fv, cv, p1) = calibration.P2[0], calibration.P2[1]
-    T = calibration.T_velo_cam
-    origin = [T[a, 0] * (-p0 / fu) + T[a, 1] * (-p1 / fv) + T[a, 3] for a in range(3)]
+    """Points (N, 3) float32 and pixels (N,): u = P2[0] x / P2[2] x and v = P2[1] x / P2[2] x solved for x and y."""
+    P2, T = calibration.P2, calibration.T_velo_cam
     points, pixels = [], []
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             if keep[v, u] and depth[v, u] > 0:
-                ray = (u - cu) / fu, (v - cv) / fv, 1.0
-                direction = [T[a, 0] * ray[0] + (T[a, 1] * ray[1] + T[a, 2] * ray[2]) for a in range(3)]
-                points.append([float(depth[v, u]) * direction[a] + origin[a] for a in range(3)])
+                z = float(depth[v, u])
+                unknowns = np.array([P2[0, :2] - u * P2[2, :2], P2[1, :2] - v * P2[2, :2]])
+                w = P2[2, 2] * z + P2[2, 3]
+                x, y = np.linalg.solve(unknowns, [u * w - P2[0, 2] * z - P2[0, 3], v * w - P2[1, 2] * z - P2[1, 3]])
+                points.append((T @ [x, y, z, 1])[:3])
                 pixels.append(v * depth.shape[1] + u)
     return np.array(points, np.float64).reshape(-1, 3).astype(np.float32), np.array(pixels, np.int64)
 

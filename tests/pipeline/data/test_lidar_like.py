@@ -9,9 +9,8 @@ import pytest
 
 from pipeline.data import open_dataset
 from pipeline.data.kitti_depth import camera_only
-from pipeline.data.lidar_like import depth_points, pixels_to_velo, sample_like_lidar
+from pipeline.data.lidar_like import depth_points, sample_like_lidar
 from tests.pipeline.data.vkitti2_tree import CX, FOCAL, HEIGHT, WIDTH, write_tree
-from tests.pipeline.tiny_kitti import CALIBRATION
 
 # Off the data set's 187, where the horizon falls on a border of the grid and rounding decides.
 CY = 187.3
@@ -52,14 +51,6 @@ def test_density_grows_with_the_rows() -> None:
     assert 0.03 < counts[0] / depth.size < 0.06
     assert counts[1] == pytest.approx(2 * counts[0], rel=0.05)
     assert counts[0] < counts[1] < counts[2]
-
-
-def test_lifting_is_the_inverse_of_projection(rng: np.random.Generator) -> None:
-    u, v, z = rng.uniform(0, 96, 50), rng.uniform(0, 48, 50), rng.uniform(0.5, 80, 50)
-    points = pixels_to_velo(u, v, z, CALIBRATION)
-    pixels, depth = CALIBRATION.cam_to_image(CALIBRATION.velo_to_cam(points))
-    np.testing.assert_allclose(pixels, np.column_stack([u, v]), atol=1e-9)
-    np.testing.assert_allclose(depth, z)
 
 
 def test_virtual_kitti_frames_have_a_sparse_input(tmp_path: Path) -> None:

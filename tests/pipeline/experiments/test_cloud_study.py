@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks.pointcloud_frame import street_frame
-from pipeline.experiments.cloud_study import StudyFrame, markdown_table, study, sweep_figure
-from pipeline.pointcloud.depth_source import read_completed
+from pipeline.base.errors import DataError
+from pipeline.experiments.cloud_study import StudyFrame, markdown_table, read_completed, study, sweep_figure
 from pipeline.pointcloud.presets import AugmentSettings
 from pipeline.pointcloud.sigma_filter import sigma_filter
 from pipeline.pointcloud.taxonomy import CLEAN, NOISE_INBET, Taxonomy, label_noise
@@ -59,12 +59,17 @@ def test_a_run_folder_is_read_with_its_surfaces(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "depth" / "7.png"), np.full((3, 4), 2560, np.uint16))
     maps = {"foreground": np.full((3, 4), 2304, np.uint16), "background": np.full((3, 4), 2816, np.uint16)}
     np.savez(tmp_path / "twin" / "7.npz", sigma=np.full((3, 4), 51, np.uint8), **maps)
-    completed = read_completed(tmp_path, "7")
+    completed = read_completed(tmp_path, "7", (3, 4))
     assert completed.foreground is not None
     assert completed.sigma is not None
     assert (completed.depth[0, 0], completed.foreground[0, 0]) == (10, 9)
     np.testing.assert_allclose(completed.sigma, 0.2, atol=1e-6)
+    # The surfaces of a run are checked wherever they are read: sigma as floats is not what a run writes.
+    np.savez(tmp_path / "twin" / "7.npz", sigma=np.full((3, 4), 0.2), **maps)
+    with pytest.raises(DataError, match=r"uint8 sigma of shape \(3, 4\)"):
+        read_completed(tmp_path, "7", (3, 4))
     (tmp_path / "twin" / "7.npz").unlink()
-    one_surface = read_completed(tmp_path, "7").sigma
-    assert one_surface is not None
-    assert (one_surface == 1).all()
+    for folder in (tmp_path, tmp_path / "depth"):
+        one_surface = read_completed(folder, "7", (3, 4)).sigma
+        assert one_surface is not None
+        assert (one_surface == 1).all()

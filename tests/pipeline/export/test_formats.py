@@ -16,6 +16,7 @@ from pipeline.check.safe_pickle import load_infos
 from pipeline.export.export import Summary, export
 from pipeline.export.formats import FORMATS
 from pipeline.export.record import Options
+from pipeline.geometry.reference_in_view import in_view_openpcdet
 from tests.pipeline.export.conftest import TinyRun
 from tests.pipeline.tiny_kitti import CALIBRATION, HEIGHT, P2, T_CAM0_VELO, WIDTH, tiny_frame
 
@@ -103,8 +104,8 @@ def test_virconv_rows(tiny_run: TinyRun, tmp_path: Path) -> None:
     assert len(measured) + len(virtual) == len(rows)
     assert (rows[: len(measured), 7] == 2).all()
     points = tiny_frame(2).points
-    u, v = project(points[:, :3].astype(np.float64))
-    inside = points[(u >= 0) & (u < WIDTH) & (v >= 0) & (v < HEIGHT)]
+    # OpenPCDet's rule, which VirConv keeps; dividing by P2's third coordinate would keep 1416 points instead of 1414.
+    inside = points[in_view_openpcdet(points, tiny_frame(2).calibration, (HEIGHT, WIDTH))]
     np.testing.assert_array_equal(measured[:, :3], inside[:, :3].astype(np.float16))
     np.testing.assert_allclose(measured[:, 3], inside[:, 3] * 10, rtol=1e-3)
     assert not measured[:, 4:7].any()

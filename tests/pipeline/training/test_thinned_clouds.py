@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from detection.inputs import in_image
+from detection.inputs import in_view_openpcdet
 from pipeline.base.errors import UsageError
 from pipeline.base.paths import RunFolder
 from pipeline.data import open_dataset
@@ -39,7 +39,7 @@ def test_every_frame_once_per_number_of_rows(root: Path, tmp_path: Path) -> None
     kept = raw[(split_rings(raw) % 4 == 0)]
     assert whole.id == thinned.id == "000001"
     assert labels[0].type == "Car"
-    full_view = in_image(type(whole)(kept, whole.T_cam_velo, whole.P2, whole.image_size, "x"))
+    full_view = in_view_openpcdet(type(whole)(kept, whole.T_cam_velo, whole.P2, whole.image_size, "x"))
     np.testing.assert_array_equal(thinned.points, kept[full_view])
     assert 0.15 < len(thinned.points) / len(whole.points) < 0.35
 

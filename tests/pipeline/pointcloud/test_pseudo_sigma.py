@@ -1,13 +1,10 @@
+"""Two surfaces from one: what lies between two walls is found, a road is not."""
+
 from __future__ import annotations
 
-from pathlib import Path
-
-import cv2
 import numpy as np
 import pytest
 
-from pipeline.base.errors import DataError
-from pipeline.pointcloud.depth_source import read_depth_folder
 from pipeline.pointcloud.pseudo_sigma import pseudo_sigma
 from pipeline.pointcloud.sigma_filter import SigmaBand, sigma_filter
 
@@ -55,25 +52,3 @@ def test_pseudo_sigma_refuses_nonsense() -> None:
         pseudo_sigma(np.full((3, 3), np.nan, np.float32))
     with pytest.raises(ValueError, match="radius >= 1"):
         pseudo_sigma(np.ones((3, 3), np.float32), radius=0)
-
-
-def test_folder_of_pngs(tmp_path: Path) -> None:
-    stored = np.zeros((4, 6), np.uint16)
-    stored[3, 5] = 256 * 20 + 128
-    cv2.imwrite(str(tmp_path / "000007.png"), stored)
-    assert read_depth_folder(tmp_path, "000007").depth[3, 5] == 20.5
-    placed = read_depth_folder(tmp_path, "000007", (6, 10)).depth
-    assert placed.shape == (6, 10)
-    assert placed[5, 7] == 20.5
-    assert np.count_nonzero(placed) == 1
-
-
-def test_folder_refuses_missing_and_wrong_files(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="000001"):
-        read_depth_folder(tmp_path, "000001")
-    cv2.imwrite(str(tmp_path / "000001.png"), np.zeros((4, 6), np.uint8))
-    with pytest.raises(DataError, match="uint16"):
-        read_depth_folder(tmp_path, "000001")
-    cv2.imwrite(str(tmp_path / "000002.png"), np.zeros((4, 6), np.uint16))
-    with pytest.raises(DataError, match="at most 3 x 3"):
-        read_depth_folder(tmp_path, "000002", (3, 3))
