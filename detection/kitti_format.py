@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from detection.text import split_fields
 from detection.types import Boxes3D
 
 COLUMNS = (
@@ -60,18 +61,20 @@ class KittiObject:
 
 
 def parse_line(line: str, *, where: str = "line", scored: bool | None = None) -> KittiObject:
-    """One line of a label (15 columns) or result (16 columns) file.
+    """One line of a label (15 columns) or result (16 columns) file; further columns are not looked at.
 
+    Exports write more columns than the devkit defines (nuScenes 16, CADC 18); its reader takes the first 15 (16).
     where   "file:number" put in front of messages
-    scored  True demands a score, False refuses one, None takes either
+    scored  True demands a score, False looks at 15 columns, None takes a score when there is one
     Raises ValueError naming the column that is wrong.
     """
-    fields = line.split()
-    expected = {True: (16,), False: (15,), None: (15, 16)}[scored]
-    if len(fields) not in expected:
-        wanted = " or ".join(map(str, expected))
+    fewest = 16 if scored else 15
+    fields = split_fields(line, fewest)
+    if len(fields) < fewest:
+        wanted = "15 or 16" if scored is None else str(fewest)
         hint = "; a result line needs a score in column 16" if scored and len(fields) == 15 else ""
         raise ValueError(f"{where}: expected {wanted} columns, got {len(fields)}{hint}")
+    fields = fields[: 15 if scored is False else 16]
     numbers: list[float] = []
     for name, text in zip(COLUMNS[1:], fields[1:]):
         try:

@@ -124,7 +124,7 @@ class Evaluation:
             "results": rows,
             "exact": [self._side_row(target, exact_ap) for target in self.targets if target.metric != "aos"],
             "recall": [self._side_row(target, found_share) for target in self.targets if target.metric != "aos"],
-            "warnings": [*small_set_warnings(rows), *skipped_summary(problems)],
+            "warnings": [*matcher.pair.notes, *small_set_warnings(rows), *skipped_summary(problems)],
             "skipped": {kind: sum(1 for found, _ in problems if found == kind) for kind, _ in problems},
             "protocol": self._choices_made(),
         }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import stat
 from pathlib import Path
 
+from detection.text import decode_text
 from pipeline.base.errors import DataError
 
 # Above any frame of the field (a KITTI frame has 2 MB); the size is looked at before anything is read.
@@ -46,11 +47,15 @@ def read_bytes(path: Path, what: str) -> bytes:
 
 
 def read_text(path: Path, what: str) -> str:
-    """A UTF-8 text file of at most 16 MB, which may be empty. Raises DataError that names `what` was expected."""
+    """A text file of at most 16 MB, which may be empty: UTF-8, or UTF-16 as PowerShell writes it; no marks are left.
+
+    Raises DataError that names `what` was expected.
+    """
+    data = read_file(path, what, MAX_TEXT_BYTES)
     try:
-        return read_file(path, what, MAX_TEXT_BYTES).decode("utf-8")
-    except UnicodeDecodeError:
-        raise DataError(path, what, "bytes that are not UTF-8 text") from None
+        return decode_text(data)
+    except ValueError as error:
+        raise DataError(path, what, str(error)) from None
 
 
 def check_inside(path: Path, root: Path) -> None:

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.errors import DataError
+from pipeline.base.files import read_text
 from pipeline.check.faults import Finding
-from pipeline.geometry.calibration import Calibration, parse_key_values
+from pipeline.geometry.calibration import Calibration
+from pipeline.geometry.key_values import parse_key_values
 
 # KITTI's five recording rigs: image size (height, width) of the day -> focal length and principal point of P_rect_02.
 KITTI_RIGS = {
@@ -27,15 +29,16 @@ _FAMILIES = {
     "raw (calib_velo_to_cam.txt)": frozenset({"R", "T"}),
 }
 _OBJECT_KEYS = ("P2", "R0_rect", "Tr_velo_to_cam")
+_WAYMO_KEYS = ("P0", "R0_rect")
 
 
-def check_family(path: Path, frame: str) -> list[Finding]:
+def check_family(path: Path, frame: str, camera: int = 2) -> list[Finding]:
     """A file of KITTI's object layout must have the object benchmark's keys."""
     try:
-        keys = set(parse_key_values(path.read_text(encoding="utf-8", errors="replace"), path))
+        keys = set(parse_key_values(read_text(path, "a calibration file"), path).lines)
     except DataError as error:
         return [Finding("unreadable_file", frame, str(path), str(error))]
-    missing = [key for key in _OBJECT_KEYS if key not in keys]
+    missing = [key for key in (_OBJECT_KEYS if camera == 2 else _WAYMO_KEYS) if key not in keys]
     if not missing:
         return []
     for name, marks in _FAMILIES.items():

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.errors import DataError
 from pipeline.check.faults import Finding
-from pipeline.data.kitti_object import MAX_COORDINATE
+from pipeline.data.bin_clouds import MAX_COORDINATE, read_rows
+from pipeline.data.cloud_columns import CloudForm
 
-ROW = 16
 # LiDARs of cars end at 120-250 m; the median return of a street lies at 10-20 m.
 _MILLIMETRE_MEDIAN = 300.0
 # Beyond this share of values that float16 holds exactly, the cloud went through float16 (measured: 0.0-0.3 % on KITTI).
@@ -31,15 +32,23 @@ class CloudFacts:
     floor: float
 
 
-def read_raw_cloud(path: Path, frame: str) -> tuple[NDArray[np.float32] | None, list[Finding]]:
+def read_raw_cloud(path: Path, form: CloudForm, frame: str) -> tuple[NDArray[np.float32] | None, list[Finding]]:
     """(N, 4) values of a .bin file as stored, or None with the reason why they cannot be used."""
-    data = path.read_bytes()
-    if not data:
-        return None, [Finding("empty_file", frame, str(path), "0 bytes")]
-    if len(data) % ROW:
-        message = f"{len(data)} bytes are not a multiple of {ROW} (float32 x y z intensity)"
-        return None, [Finding("truncated_cloud", frame, str(path), message)]
-    return np.frombuffer(data, dtype="<f4").reshape(-1, 4), []
+    try:
+        rows = read_rows(path, form)
+    except DataError as error:
+        message = f"expected {error.expected}, got {error.found}; {error.hint}".removesuffix("; ")
+        return None, [Finding(_file_fault(error), frame, str(path), message)]
+    return rows[:, :4], []
+
+
+def _file_fault(error: DataError) -> str:
+    """The fault of a .bin file that is no rows."""
+    if error.found == "an empty file":
+        return "empty_file"
+    if error.found.endswith("columns a point"):
+        return "wrong_columns"
+    return "truncated_cloud" if error.found.endswith(" bytes") else "unreadable_file"
 
 
 def check_cloud(points: NDArray[np.floating], frame: str, where: str) -> list[Finding]:

@@ -40,6 +40,7 @@ class Comparison:
     rigs: dict[tuple[int, int], dict[tuple[float, ...], list[str]]] = field(default_factory=dict)
     tall_cars: int = 0
     all_cars: int = 0
+    label_columns: dict[str, int] = field(default_factory=dict)
     gains: dict[str, tuple[float, ...]] = field(default_factory=dict)
     scores: dict[str, dict[int, float]] = field(default_factory=dict)
     window: deque[tuple[str, Structure | None]] = field(default_factory=deque)
@@ -59,6 +60,7 @@ class Comparison:
             self.rigs.setdefault(facts.size, {}).setdefault(facts.rig, []).append(facts.frame)
         self.tall_cars += facts.cars[0]
         self.all_cars += facts.cars[1]
+        self.label_columns[facts.frame] = facts.label_columns
         if facts.gains:
             self.gains[facts.frame] = facts.gains
         self._compare(facts)
@@ -90,6 +92,13 @@ class Comparison:
         if self.all_cars >= 20 and self.tall_cars > 0.8 * self.all_cars:
             message = f"{self.tall_cars} of {self.all_cars} cars are higher than wide: height and width exchanged?"
             yield Finding("swapped_dimensions", "", self.root, message)
+
+    def notes(self) -> list[str]:
+        """What the frames have that is taken though the layout has it otherwise."""
+        wide = [columns for columns in self.label_columns.values() if columns > 15]
+        if not wide:
+            return []
+        return [f"{self.root}: {len(wide)} label files have up to {max(wide)} columns; the first 15 are read"]
 
     def _missing(self) -> Iterator[Finding]:
         counts = Counter(part for parts in self.present.values() for part in parts)
@@ -192,9 +201,13 @@ def _exchanged(scores: dict[int, float], other: dict[int, float], offset: int) -
     return min(gains) > 0.04 and sum(gains) > 0.15 and max(scores[0], other[0]) < 0.08
 
 
-def examine_dataset(dataset: Dataset, workers: int, progress: Callable[[str], None] | None = None) -> Iterator[Finding]:
-    """Findings of every frame of a data set and of their comparison."""
+def examine_dataset(
+    dataset: Dataset, workers: int, progress: Callable[[str], None] | None = None, notes: list[str] | None = None
+) -> Iterator[Finding]:
+    """Findings of every frame of a data set and of their comparison; `notes` gets what is worth a word though sound."""
     comparison = Comparison(dataset.name, dataset.root)
+    for path in dataset.strays:
+        yield Finding("extra_file", path.stem, str(path), f"belongs to none of {len(dataset)} frames")
     task = partial(examine_frame, dataset.open)
     for facts in map_ordered(task, places(dataset), workers):
         yield from facts.findings
@@ -202,6 +215,8 @@ def examine_dataset(dataset: Dataset, workers: int, progress: Callable[[str], No
         if progress is not None:
             progress(facts.frame)
     yield from comparison.findings()
+    if notes is not None:
+        notes += comparison.notes()
 
 
 def places(dataset: Dataset) -> Iterable[Place]:

@@ -21,8 +21,8 @@ from pipeline.check.outputs import (
     examine_run_frame,
 )
 from pipeline.check.virtual import examine_sfd, examine_virconv
-from pipeline.data import READERS
-from pipeline.data.dataset import Dataset
+from pipeline.data import READERS, open_dataset
+from pipeline.data.dataset import Dataset, read_split
 from pipeline.data.frame import Frame
 from pipeline.data.nyuv2 import open_nyuv2_full
 from pipeline.export.source import in_run
@@ -45,12 +45,16 @@ FORMATS = (*READERS, *INFOS, *FOLDERS)
 
 @dataclass(frozen=True)
 class Report:
-    """Result of a check: what was examined, how many frames, and the findings (empty when nothing is wrong)."""
+    """Result of a check: what was examined, how many frames, and the findings (empty when nothing is wrong).
+
+    notes  what is taken though it is not written as the format has it
+    """
 
     path: str
     format: str
     frames: int
     findings: tuple[Finding, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def clean(self) -> bool:
@@ -66,6 +70,7 @@ class Report:
             "clean": self.clean,
             "faults": dict(Counter(finding.fault for finding in self.findings)),
             "findings": [finding.as_dict() for finding in self.findings],
+            "notes": list(self.notes),
         }
 
     def lines(self, shown: int = 5) -> Iterator[str]:
@@ -78,6 +83,7 @@ class Report:
             yield from (f"    {f.frame or '-'} {f.where}: {f.message}" for f in places[:shown])
             if count > shown:
                 yield f"    ... and {count - shown} more"
+        yield from (f"  note: {note}" for note in self.notes)
 
 
 def check(
@@ -87,6 +93,7 @@ def check(
     frames: str | None = None,
     workers: int | None = None,
     progress: Callable[[str], None] | None = None,
+    columns: int | None = None,
 ) -> Report:
     """Examines a data set or an exported folder.
 
@@ -94,6 +101,7 @@ def check(
     reference    the data set that a run, a depth or a result folder was made from
     frames       selection of the frames (see `Dataset.select`), all when None
     workers      processes; None: all cores
+    columns      float32 numbers per point of .bin clouds, when they are not x y z intensity
     Raises UsageError when the folder is not recognised or a reference is needed.
     """
     if not path.exists():
@@ -101,20 +109,23 @@ def check(
     kind = format_name or recognise(path)
     if kind not in FORMATS:
         raise UsageError(f"unknown format {kind!r}; known: {', '.join(FORMATS)}")
+    notes: list[str] = []
     if kind in FOLDERS:
         count, findings = _check_folder(path, kind, reference, frames, workers, progress)
     else:
-        dataset = open_checked(kind, path)
+        dataset = open_checked(kind, path, columns)
         dataset = dataset.select(frames) if frames else dataset
         count = len(dataset)
-        findings = examine_dataset(dataset, workers or default_workers(count), progress)
+        notes += dataset.notes
+        findings = examine_dataset(dataset, workers or default_workers(count), progress, notes)
     found = [*findings, *_check_infos(path, kind), *_check_splits(path)]
-    return Report(str(path), kind, count, tuple(causes(found)))
+    return Report(str(path), kind, count, tuple(causes(found)), tuple(notes))
 
 
-def open_checked(kind: str, path: Path) -> Dataset:
+def open_checked(kind: str, path: Path, columns: int | None = None) -> Dataset:
     """The data set of a format; NYU frames as they are stored, info formats by their KITTI folders."""
-    dataset = open_nyuv2_full(path) if kind == "nyuv2" else READERS["kitti_object" if kind in INFOS else kind](path)
+    name = "kitti_object" if kind in INFOS else kind
+    dataset = open_nyuv2_full(path) if kind == "nyuv2" else open_dataset(name, path, columns)
     return replace(dataset, open=partial(open_present, dataset.open))
 
 
@@ -225,7 +236,7 @@ def _expected(
 ) -> list[str]:
     """Frames that should have a file: the export's split lists, else the data set when most of it is there."""
     lists = [file for file in (path / "ImageSets").glob("*.txt") if file.stem != "test"]
-    listed = {names.get(name, name) for file in lists for name in file.read_text(encoding="utf-8").split()}
+    listed = {names.get(name, name) for file in lists for name in read_split(file)}
     if listed and kind in ("sfd", "virconv"):
         return [frame for frame in wanted if frame in listed]
     present = sum(frame in found for frame in wanted)
@@ -242,8 +253,7 @@ def _check_infos(path: Path, kind: str) -> Iterator[Finding]:
 def _check_splits(path: Path) -> Iterator[Finding]:
     """Frames that are in the train and in the val list."""
     lists = path / "ImageSets"
-    parts = [set((lists / f"{name}.txt").read_text(encoding="utf-8").split()) for name in ("train", "val")
-             if (lists / f"{name}.txt").is_file()]  # fmt: skip
+    parts = [set(read_split(lists / f"{name}.txt")) for name in ("train", "val") if (lists / f"{name}.txt").is_file()]
     if len(parts) == 2 and parts[0] & parts[1]:
         shared = sorted(parts[0] & parts[1])
         yield Finding(

@@ -22,7 +22,8 @@ from pipeline.check.clouds import CloudFacts, check_cloud, cloud_facts, read_raw
 from pipeline.check.depths import check_depth, file_fault, read_map
 from pipeline.check.faults import Finding
 from pipeline.check.images import CROP_SHIFTS, Structure, colours_swapped, shift_gains, structure
-from pipeline.check.labels import check_objects, read_objects
+from pipeline.check.labels import check_objects, read_objects, wide_lines
+from pipeline.data.cloud_columns import CloudForm
 from pipeline.data.frame import Frame
 from pipeline.export.geometry import boxes_in_lidar, points_in_box
 from pipeline.geometry.calibration import Calibration
@@ -75,6 +76,7 @@ class FrameFacts:
     structure: Structure | None = None
     gains: tuple[float, ...] = ()
     cars: tuple[int, int] = (0, 0)
+    label_columns: int = 0
 
 
 @dataclass
@@ -113,6 +115,12 @@ def source_path(frame: Frame, part: str) -> Path | None:
     # Readers of tables bind a folder: such a part has no file of its own.
     paths = [path for path in paths if not path.is_dir()]
     return paths[-1] if paths else None
+
+
+def _argument(frame: Frame, part: str, default: Any, kind: type) -> Any:
+    """The argument of a kind that the reader bound to the part's loader: how the files of this data set are read."""
+    arguments = getattr(frame.loaders.get(part), "args", ())
+    return next((argument for argument in arguments if isinstance(argument, kind)), default)
 
 
 def open_present(open_frame: Callable[[str], Frame], frame_id: str) -> Frame:
@@ -154,7 +162,13 @@ def examine_frame(open_frame: Callable[[str], Frame], place: Place) -> FrameFact
         structure=maps,
         gains=gains,
         cars=(sum(o.size[0] > o.size[1] for o in cars), len(cars)),
+        label_columns=_label_columns(frame),
     )
+
+
+def _label_columns(frame: Frame) -> int:
+    path = source_path(frame, "labels")
+    return wide_lines(path) if path is not None and path.suffix.lower() == ".txt" and path.is_file() else 0
 
 
 def _is_there(frame: Frame, part: str) -> bool:
@@ -203,7 +217,7 @@ def _read_calibration(parts: _Parts, layout: str) -> None:
         parts.findings.append(Finding("empty_file", frame.id, str(path), "0 bytes"))
         return
     if layout == "kitti_object" and path is not None and path.is_file():
-        found = check_family(path, frame.id)
+        found = check_family(path, frame.id, _argument(frame, "calibration", 2, int))
         parts.findings += found
         if found:
             return
@@ -223,8 +237,8 @@ def _read_cloud(parts: _Parts) -> None:
     if not frame.has("points"):
         return
     path = source_path(frame, "points")
-    if path is not None and path.suffix == ".bin" and path.is_file():
-        points, found = read_raw_cloud(path, frame.id)
+    if path is not None and path.suffix.lower() == ".bin" and path.is_file():
+        points, found = read_raw_cloud(path, _argument(frame, "points", CloudForm(), CloudForm), frame.id)
         parts.findings += found
     else:
         points = parts.load("points")
@@ -240,7 +254,7 @@ def _read_labels(parts: _Parts) -> None:
     if not frame.has("labels"):
         return
     path = source_path(frame, "labels")
-    if path is not None and path.suffix == ".txt":
+    if path is not None and path.suffix.lower() == ".txt":
         objects, found = read_objects(path, frame.id, scored=False)
     else:
         objects, found = parts.load("labels") or [], []

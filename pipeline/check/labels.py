@@ -8,6 +8,8 @@ import numpy as np
 
 from detection.boxes import observation_angle, project_to_image, wrap_angle
 from detection.kitti_format import KittiObject, boxes_of, parse_lines
+from pipeline.base.errors import DataError
+from pipeline.base.files import read_text
 from pipeline.check.faults import Finding
 from pipeline.geometry.calibration import Calibration
 
@@ -24,17 +26,32 @@ UNKNOWN_ALPHA = -10.0
 def read_objects(path: Path, frame: str, scored: bool) -> tuple[list[KittiObject], list[Finding]]:
     """The objects of a label file (or of a result file with `scored`) and what is wrong with its lines."""
     try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        return [], [Finding("malformed_labels", frame, str(path), "bytes that are not UTF-8 text")]
-    columns = {len(line.split()) for line in text.splitlines() if line.strip()}
-    if (15 if scored else 16) in columns and columns <= {15, 16}:
-        what = "15 columns in a folder of results" if scored else "16 columns (with scores) in a folder of labels"
-        return [], [Finding("label_result_mixup", frame, str(path), what)]
-    try:
-        return parse_lines(text, where=path.name, scored=scored), []
+        text = read_text(path, "a KITTI result file" if scored else "a KITTI label file")
+        objects = parse_lines(text, where=path.name, scored=None if scored else False)
+        with_scores = parse_lines(text, where=path.name)
     except ValueError as error:
-        return [], [Finding("malformed_labels", frame, str(path), str(error))]
+        message = f"expected {error.expected}, got {error.found}" if isinstance(error, DataError) else str(error)
+        return [], [Finding("malformed_labels", frame, str(path), message)]
+    if scored and any(o.score is None for o in objects):
+        what = "15 columns in a folder of results"
+    elif not scored and any(_is_result(o) for o in with_scores):
+        what = "results (scores in column 16) in a folder of labels"
+    else:
+        return objects, []
+    return [], [Finding("label_result_mixup", frame, str(path), what)]
+
+
+def _is_result(item: KittiObject) -> bool:
+    """Scores are fractions or come with -1 -1; exports of labels fill column 16 with a whole number (nuScenes: 0)."""
+    return item.score is not None and (item.score % 1 != 0 or (item.truncated == -1 and item.occluded == -1))
+
+
+def wide_lines(path: Path) -> int:
+    """The most columns of a line of a label file, 0 when it cannot be read."""
+    try:
+        return max((len(line.split()) for line in read_text(path, "labels").splitlines()), default=0)
+    except DataError:
+        return 0
 
 
 def check_objects(

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.errors import DataError
+from pipeline.data.bin_clouds import read_velodyne
+from pipeline.data.cloud_columns import CloudForm
 from pipeline.data.images import read_bytes
-from pipeline.data.kitti_object import read_velodyne
 
 SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
 _PLY_TYPES = {
@@ -39,6 +40,7 @@ _PLY_TYPES = {
 }
 # A header longer than this is not a header.
 _MAX_HEADER = 65536
+_KITTI = CloudForm()
 
 
 @dataclass(frozen=True)
@@ -57,11 +59,11 @@ class Cloud:
         return self.values[:, self.columns.index(name)]
 
 
-def read_points(path: str | Path) -> NDArray[np.float32]:
+def read_points(path: str | Path, form: CloudForm = _KITTI) -> NDArray[np.float32]:
     """(N, 4) float32 x y z intensity of a .bin, .npy, .ply or .pcd file; intensity 0 when the file has none."""
     path = Path(path)
-    if path.suffix == ".bin":
-        return read_velodyne(path)
+    if path.suffix.lower() == ".bin":
+        return read_velodyne(path, form)
     cloud = read_cloud(path)
     wanted = [cloud.column(name) for name in ("x", "y", "z")]
     intensity = next((name for name in ("intensity", "reflectance", "i") if name in cloud.columns), None)
@@ -76,15 +78,15 @@ def read_points(path: str | Path) -> NDArray[np.float32]:
 def read_cloud(path: str | Path) -> Cloud:
     """All columns of a .npy, .ply or .pcd file. Raises DataError on damage or an unknown format."""
     path = Path(path)
-    if path.suffix not in SUFFIXES[1:]:
+    if path.suffix.lower() not in SUFFIXES[1:]:
         raise DataError(path, f"a point cloud ({', '.join(SUFFIXES)})", f"a {path.suffix or 'nameless'} file")
     data = read_bytes(path, "a point cloud")
-    if path.suffix == ".npy":
+    if path.suffix.lower() == ".npy":
         return _read_npy(data, path)
     try:
         # Numbers beyond float32 become infinite here; `read_points` refuses them.
         with np.errstate(over="ignore", invalid="ignore"):
-            cloud = _read_ply(data, path) if path.suffix == ".ply" else _read_pcd(data, path)
+            cloud = _read_ply(data, path) if path.suffix.lower() == ".ply" else _read_pcd(data, path)
     except (IndexError, ValueError, TypeError, OverflowError) as error:
         if isinstance(error, DataError):
             raise

@@ -7,7 +7,9 @@ from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+from detection.evaluation.reading import renamed_like
 from pipeline.base.errors import DataError, UsageError
+from pipeline.base.files import read_text
 from pipeline.data.frame import Frame
 
 
@@ -19,6 +21,9 @@ class Dataset:
     open   id -> Frame; nothing of the frame is read until one of its parts is asked for
     name   data set name ("kitti_object", ...)
     root   folder, named in messages
+    notes    what was taken although it is not written as the layout has it, one line a kind
+    strays   files that look like a part of a frame but belong to none
+    refusal  why no frame can be read as it is, or nothing: the line with which a run ends before it begins
 
     A plain value: it travels to worker processes when `open` does (readers use functools.partial of a module function).
     """
@@ -27,6 +32,9 @@ class Dataset:
     open: Callable[[str], Frame] = field(repr=False)
     name: str = ""
     root: str = ""
+    notes: tuple[str, ...] = ()
+    strays: tuple[Path, ...] = ()
+    refusal: str = ""
     _known: frozenset[str] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -63,7 +71,9 @@ class Dataset:
         """
         wanted = self._positions(frames)
         if wanted is None:
-            wanted = tuple(name for entry in _names(frames) for name in self._matching(entry))  # type: ignore[arg-type]
+            named = [name for entry in _names(frames) for name in self._matching(entry)]  # type: ignore[arg-type]
+            # 1, 001 and 000001 are the same frame, as everywhere.
+            wanted = tuple(renamed_like(named, self.ids).get(name, name) for name in named)
         missing = [frame_id for frame_id in wanted if frame_id not in self._known]
         if missing:
             shown = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
@@ -107,8 +117,7 @@ def _names(frames: str | Path | Iterable[str]) -> list[str]:
 
 def read_split(path: Path) -> list[str]:
     """Frame ids of a split file: one a line, blank lines and lines starting with '#' skipped."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        raise UsageError(f"split file not found: {path} (one frame id a line)") from None
+    if not path.exists():
+        raise UsageError(f"split file not found: {path} (one frame id a line)")
+    lines = read_text(path, "a split file (one frame id a line)").splitlines()
     return [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]

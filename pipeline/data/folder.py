@@ -10,58 +10,69 @@ ROOT/semantics/ID.png     8-bit Cityscapes trainIds                   ROOT/insta
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pipeline.base.errors import UsageError
+from pipeline.data.cloud_columns import CloudForm, cloud_form
 from pipeline.data.cloud_files import SUFFIXES, read_points
 from pipeline.data.dataset import Dataset
 from pipeline.data.depth_png import read_depth_png
 from pipeline.data.frame import Frame
 from pipeline.data.images import image_size, read_image
 from pipeline.data.kitti_object import read_instances, read_labels, read_semantics
+from pipeline.data.part_files import PartFiles, as_dataset, index_frames
 from pipeline.geometry.calibration import read_calibration
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+# part -> (folder, suffixes, the preferred one first)
+_LAYOUT: dict[str, tuple[str, tuple[str, ...]]] = {
+    "image": ("images", (".png", ".jpg", ".jpeg")),
+    "points": ("points", SUFFIXES),
+    "calibration": ("calib", (".txt",)),
+    "labels": ("labels", (".txt",)),
+    "sparse_depth": ("sparse_depth", (".png",)),
+    "target_depth": ("target_depth", (".png",)),
+    "semantics": ("semantics", (".png",)),
+    "instances": ("instances", (".png",)),
+}
 
 
-def open_folder(root: str | Path) -> Dataset:
+def open_folder(root: str | Path, columns: int | None = None) -> Dataset:
     """Frames of a user's folder, one per file in images/, sorted by name.
 
+    columns  float32 numbers per point of .bin clouds; None: 4, unless the clouds show another number (refused)
     Raises UsageError when there is no images/ folder or no image in it.
     """
     folder = Path(root)
-    images = folder / "images"
-    ids = sorted(path.stem for path in images.iterdir() if path.suffix in IMAGE_SUFFIXES) if images.is_dir() else []
-    if not ids:
+    parts = {part: PartFiles(folder / name, suffixes) for part, (name, suffixes) in _LAYOUT.items()}
+    index = index_frames(parts, ("image",))
+    if not index.ids:
         raise UsageError(f"{folder}: no image found (expected images/ID.png or .jpg, points/ID.bin and calib.txt)")
-    return Dataset(tuple(ids), partial(open_frame, folder), "folder", str(folder))
+    clouds = [folder / "points" / n for n in parts["points"].stems().values() if n.lower().endswith(".bin")]
+    form = cloud_form(clouds, columns)
+    opener = partial(open_frame, folder, index.parts, form)
+    return as_dataset(index, Dataset(index.ids, opener, "folder", str(folder), refusal=form.refusal_of(folder)))
 
 
-def _first(folder: Path, frame_id: str, suffixes: tuple[str, ...]) -> Path | None:
-    """The file of a frame with one of the suffixes, or None."""
-    paths = (folder / f"{frame_id}{suffix}" for suffix in suffixes)
-    return next((path for path in paths if path.is_file()), None)
-
-
-def open_frame(root: Path, frame_id: str) -> Frame:
+def open_frame(root: Path, parts: Mapping[str, PartFiles], form: CloudForm, frame_id: str) -> Frame:
     """One frame; nothing is read yet. Parts without a file are not offered."""
-    image = _first(root / "images", frame_id, IMAGE_SUFFIXES) or root / "images" / f"{frame_id}.png"
-    own = root / "calib" / f"{frame_id}.txt"
+    paths = {part: files.path(frame_id) for part, files in parts.items()}
+    own = paths["calibration"]
     loaders: dict[str, Callable[[], Any]] = {
-        "image": partial(read_image, image),
-        "image_size": partial(image_size, image),
+        "image": partial(read_image, paths["image"]),
+        "image_size": partial(image_size, paths["image"]),
         "calibration": partial(read_calibration, own if own.is_file() else root / "calib.txt"),
     }
-    optional: dict[str, tuple[Callable[[Path], Any], Path | None]] = {
-        "points": (read_points, _first(root / "points", frame_id, SUFFIXES)),
-        "labels": (read_labels, _first(root / "labels", frame_id, (".txt",))),
-        "sparse_depth": (read_depth_png, _first(root / "sparse_depth", frame_id, (".png",))),
-        "target_depth": (read_depth_png, _first(root / "target_depth", frame_id, (".png",))),
-        "semantics": (read_semantics, _first(root / "semantics", frame_id, (".png",))),
-        "instances": (read_instances, _first(root / "instances", frame_id, (".png",))),
+    optional: dict[str, Callable[[Path], Any]] = {
+        "labels": read_labels,
+        "sparse_depth": read_depth_png,
+        "target_depth": read_depth_png,
+        "semantics": read_semantics,
+        "instances": read_instances,
     }
-    loaders.update({part: partial(reader, path) for part, (reader, path) in optional.items() if path is not None})
+    if paths["points"].is_file():
+        loaders["points"] = partial(read_points, paths["points"], form)
+    loaders.update({part: partial(read, paths[part]) for part, read in optional.items() if paths[part].is_file()})
     return Frame(frame_id, loaders, str(root))

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from detection.kitti_format import KittiObject
 from detection.types import PointFrame
 from pipeline.base.errors import MissingPart
+from pipeline.data.cloud_columns import CloudForm
 from pipeline.geometry.calibration import Calibration
 
 PARTS = (
@@ -68,6 +69,12 @@ class Frame:
         if part == "sparse_depth" and not self.has(part):
             return ("points", "calibration", *self.sources("image_size"))
         return (part,)
+
+    def forms(self, part: str) -> tuple[str, ...]:
+        """How the files of `part` are read: its loader's other arguments, such as the columns of a cloud."""
+        loader = self.loaders.get(part)
+        arguments = (*loader.args, *loader.keywords.values()) if isinstance(loader, partial) else ()
+        return tuple(repr(argument) for argument in arguments if isinstance(argument, (int, str, CloudForm)))
 
     def _load(self, part: str) -> Any:
         if part not in self.loaders:

@@ -21,13 +21,15 @@ from typing import Any
 import numpy as np
 
 from pipeline.base.errors import DataError, UsageError
+from pipeline.base.files import read_text
 from pipeline.data.dataset import Dataset
 from pipeline.data.depth_png import read_depth_png
 from pipeline.data.frame import Frame
-from pipeline.data.images import image_size, read_bytes, read_image
+from pipeline.data.images import image_size, read_image
 from pipeline.data.kitti_object import read_velodyne
 from pipeline.data.kitti_raw import DAY_LENGTH, raw_image_path, read_day_calibration
 from pipeline.geometry.calibration import Calibration
+from pipeline.geometry.key_values import KeyValues
 
 Loaders = dict[str, Callable[[], Any]]
 
@@ -202,14 +204,8 @@ def _loose_frame(root: Path, frame_id: str, *, image: Path, sparse: Path, target
 
 def read_intrinsics(path: Path) -> Calibration:
     """A text file of nine numbers (row-major 3 x 3 camera matrix) as a calibration; see `camera_only`."""
-    text = read_bytes(path, "nine numbers of a camera matrix").decode("utf-8", errors="replace")
-    try:
-        values = np.array([float(word) for word in text.split()])
-    except ValueError:
-        raise DataError(path, "nine numbers of a camera matrix", f"{text[:40]!r}") from None
-    if values.size != 9 or not np.isfinite(values).all():
-        raise DataError(path, "nine finite numbers of a camera matrix", f"{values.size} numbers")
-    return camera_only(values.reshape(3, 3))
+    text = read_text(path, "nine numbers of a camera matrix")
+    return camera_only(KeyValues({"camera matrix": (1, text)}, path).matrix(("camera matrix",), (3, 3)))
 
 
 # LiDAR axes (x forward, y left, z up) -> camera axes (x right, y down, z forward).

@@ -2,13 +2,15 @@
 
     ROOT/training/{image_2,velodyne,calib,label_2}/ID.{png|jpg,bin,txt,txt}      ROOT/ImageSets/{train,val,...}.txt
 
+Also image_02/label_02, and Waymo's image_0/label_0 with P0 and Tr_velo_to_cam_0 in the calibration.
+
 Beyond the official folders, synthetic data may hold `depth_2` (dense true depth, 16-bit PNG), `semantic_2` (uint8
 Cityscapes trainIds) and `instance_2` (uint16, 0 = none); they are read when present. Source: KITTI object devkit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,102 +21,80 @@ from numpy.typing import NDArray
 from auglidar_base.atomic import write_bytes, write_text
 from detection.kitti_format import KittiObject, format_line, parse_lines
 from pipeline.base.errors import DataError, UsageError
-from pipeline.base.files import read_bytes, read_text
+from pipeline.base.files import read_text
+from pipeline.data.bin_clouds import read_velodyne
+from pipeline.data.cloud_columns import CloudForm, cloud_form
 from pipeline.data.dataset import Dataset
 from pipeline.data.depth_png import png_bytes, read_depth_png, write_depth_png
 from pipeline.data.frame import Frame
 from pipeline.data.images import image_size, read_image, read_unchanged
+from pipeline.data.part_files import PartFiles, as_dataset, first_folder, index_frames
 from pipeline.geometry.calibration import Calibration, format_calibration, read_calibration
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-# Folders whose files make a frame: a frame that lacks one of them is reported when it is used, not left out silently.
-_FRAME_FOLDERS = ("image_2", "velodyne", "calib")
-# A return farther than this is damage: the sensor ends at 120 m.
-MAX_COORDINATE = 10_000.0
+# part -> (folders it may lie in, suffixes). image_0 and label_0 are the front camera of Waymo's KITTI form; image_02
+# and label_02 are folders of KITTI's tracking benchmark.
+_LAYOUT: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "image": (("image_2", "image_02", "image_0"), IMAGE_SUFFIXES),
+    "points": (("velodyne",), (".bin",)),
+    "calibration": (("calib",), (".txt",)),
+    "labels": (("label_2", "label_02", "label_0"), (".txt",)),
+    "target_depth": (("depth_2",), (".png",)),
+    "semantics": (("semantic_2",), (".png",)),
+    "instances": (("instance_2",), (".png",)),
+}
+# Files that make a frame: one that lacks one of them is reported when it is used, one that lacks two is no frame.
+_MAKERS = ("image", "points", "calibration")
 
 
-def open_kitti_object(root: str | Path) -> Dataset:
+def open_kitti_object(root: str | Path, columns: int | None = None) -> Dataset:
     """The frames of a KITTI object folder, sorted by id.
 
-    root  the folder that holds training/ (or testing/), or such a folder itself
+    root     the folder that holds training/ (or testing/), or such a folder itself
+    columns  float32 numbers per point of the .bin clouds; None: 4, unless the clouds show another number (refused)
     Raises UsageError when there is no such folder or no frame in it.
     """
     folder = split_folder(Path(root))
-    found = {path.stem for name in _FRAME_FOLDERS for path in _files(folder / name)}
-    if not found:
+    parts = {part: PartFiles(first_folder(folder, names), suffixes) for part, (names, suffixes) in _LAYOUT.items()}
+    index = index_frames(parts, _MAKERS, fewest=2)
+    if not index.ids:
         raise UsageError(f"{folder}: no frame found (expected files in image_2/, velodyne/ and calib/)")
-    return Dataset(tuple(sorted(found)), partial(open_frame, folder), "kitti_object", str(folder))
+    form = cloud_form([parts["points"].folder / name for name in parts["points"].stems().values()], columns)
+    opener = partial(open_frame, str(folder), index.parts, form)
+    return as_dataset(index, Dataset(index.ids, opener, "kitti_object", str(folder), refusal=form.refusal_of(folder)))
 
 
 def split_folder(root: Path) -> Path:
-    """`root` itself when it holds image_2 or velodyne, else its training/ or testing/."""
+    """`root` itself when it holds images or velodyne, else its training/ or testing/."""
     if not root.is_dir():
         raise UsageError(f"no such folder: {root} (expected a KITTI object folder with training/ or testing/ in it)")
     for folder in (root, root / "training", root / "testing"):
-        if any((folder / name).is_dir() for name in ("image_2", "velodyne")):
+        if any((folder / name).is_dir() for name in (*_LAYOUT["image"][0], "velodyne")):
             return folder
     raise UsageError(
         f"{root}: expected training/ (or testing/) with image_2/, velodyne/ and calib/; found none of them"
     )
 
 
-def _files(folder: Path) -> Iterable[Path]:
-    """The files of a folder (none when it does not exist), hidden ones left out."""
-    if not folder.is_dir():
-        return ()
-    return (path for path in folder.iterdir() if not path.name.startswith("."))
-
-
-def open_frame(folder: Path, frame_id: str) -> Frame:
+def open_frame(where: str, parts: Mapping[str, PartFiles], form: CloudForm, frame_id: str) -> Frame:
     """One frame of a training/ or testing/ folder; nothing is read yet."""
-    image = image_path(folder, frame_id)
+    image = parts["image"].path(frame_id)
+    camera = 0 if parts["image"].folder.name == "image_0" else 2
     loaders: dict[str, Callable[[], Any]] = {
         "image": partial(read_image, image),
         "image_size": partial(image_size, image),
-        "points": partial(read_velodyne, folder / "velodyne" / f"{frame_id}.bin"),
-        "calibration": partial(read_calibration, folder / "calib" / f"{frame_id}.txt"),
+        "points": partial(read_velodyne, parts["points"].path(frame_id), form),
+        "calibration": partial(read_calibration, parts["calibration"].path(frame_id), camera),
     }
-    optional: dict[str, tuple[Callable[[Path], Any], Path]] = {
-        "labels": (read_labels, folder / "label_2" / f"{frame_id}.txt"),
-        "target_depth": (read_depth_png, folder / "depth_2" / f"{frame_id}.png"),
-        "semantics": (read_semantics, folder / "semantic_2" / f"{frame_id}.png"),
-        "instances": (read_instances, folder / "instance_2" / f"{frame_id}.png"),
+    optional: dict[str, Callable[[Path], Any]] = {
+        "labels": read_labels,
+        "target_depth": read_depth_png,
+        "semantics": read_semantics,
+        "instances": read_instances,
     }
-    loaders.update({part: partial(read, path) for part, (read, path) in optional.items() if path.is_file()})
-    return Frame(frame_id, loaders, str(folder))
-
-
-def image_path(folder: Path, frame_id: str) -> Path:
-    """The image of a frame, PNG or JPEG; the PNG path when there is none."""
-    paths = [folder / "image_2" / f"{frame_id}{suffix}" for suffix in IMAGE_SUFFIXES]
-    return next((path for path in paths if path.is_file()), paths[0])
-
-
-def read_velodyne(path: str | Path) -> NDArray[np.float32]:
-    """(N, 4) float32 x y z intensity in the LiDAR frame, metres.
-
-    Raises DataError when the file is missing, empty, not a multiple of 16 bytes, or holds NaN, infinite or absurdly
-    distant coordinates.
-    """
-    path = Path(path)
-    what = "a velodyne cloud (float32 x y z intensity)"
-    data = read_bytes(path, what)
-    if len(data) % 16:
-        hint = "it is truncated, or it has other columns (nuScenes has 5, plain XYZ has 3)"
-        raise DataError(path, f"{what}: a multiple of 16 bytes", f"{len(data)} bytes", hint)
-    points = np.frombuffer(data, dtype="<f4").reshape(-1, 4).astype(np.float32)
-    bad = ~np.isfinite(points).all(axis=1)
-    if bad.any():
-        found = (
-            f"{int(bad.sum())} of {len(points)} points with NaN or infinite values (first: point {int(bad.argmax())})"
-        )
-        raise DataError(path, f"{what} of finite numbers", found)
-    largest = float(np.abs(points[:, :3]).max())
-    if largest > MAX_COORDINATE:
-        raise DataError(
-            path, f"coordinates within {MAX_COORDINATE:g} m", f"{largest:g} m", "is it float32 x y z intensity?"
-        )
-    return points
+    paths = {part: parts[part].path(frame_id) for part in optional}
+    loaders.update({part: partial(read, paths[part]) for part, read in optional.items() if paths[part].is_file()})
+    return Frame(frame_id, loaders, where)
 
 
 def read_labels(path: str | Path, scored: bool = False) -> list[KittiObject]:

@@ -15,10 +15,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pipeline.base.errors import DataError, UsageError
+from pipeline.base.errors import UsageError
+from pipeline.base.files import read_text
 from pipeline.data.dataset import Dataset
 from pipeline.data.frame import Frame
-from pipeline.data.images import image_size, read_bytes, read_image
+from pipeline.data.images import image_size, read_image
 from pipeline.data.kitti_object import read_velodyne
 from pipeline.geometry.calibration import Calibration, parse_raw_calibration
 
@@ -76,11 +77,6 @@ def raw_image_path(drive: Path, camera: str, name: str) -> Path:
 
 def read_day_calibration(day: Path) -> Calibration:
     """Calibration of a recording day (left colour camera as P2, right one as P3). Raises DataError when incomplete."""
-    texts = []
-    for name in ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt"):
-        data = read_bytes(day / name, "a KITTI raw calibration file")
-        try:
-            texts.append(data.decode("utf-8"))
-        except UnicodeDecodeError:
-            raise DataError(day / name, "a text file", "bytes that are not UTF-8") from None
-    return parse_raw_calibration(texts[0], texts[1], day)
+    names = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
+    cameras, velodyne = (read_text(day / name, "a KITTI raw calibration file") for name in names)
+    return parse_raw_calibration(cameras, velodyne, day)

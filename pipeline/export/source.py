@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from completion.types import CompletedDepth
+from detection.evaluation.reading import renamed_like
 from detection.kitti_format import KittiObject
 from pipeline.base.errors import DataError, MissingPart
 from pipeline.base.paths import RunFolder
 from pipeline.data.cloud_files import Cloud
+from pipeline.data.dataset import read_split
 from pipeline.data.frame import Frame
 from pipeline.data.kitti_object import read_labels
 from pipeline.geometry.in_view import lidar_pixels, value_at
@@ -143,7 +145,7 @@ def read_splits(root: Path, frame_ids: Sequence[str]) -> dict[str, tuple[str, ..
         for name in lists.get(root.name, ("train", "val", "trainval", "test")):
             path = folder / "ImageSets" / f"{name}.txt"
             if path.is_file():
-                listed = set(path.read_text(encoding="utf-8").split())
+                listed = set(renamed_like(read_split(path), frame_ids).values())
                 found[name] = tuple(frame_id for frame_id in frame_ids if frame_id in listed)
         if found:
             break

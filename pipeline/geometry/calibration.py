@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.errors import DataError
 from pipeline.base.files import read_text
+from pipeline.geometry.key_values import parse_key_values
 
 Array = NDArray[np.float64]
 
@@ -96,73 +97,47 @@ class Calibration:
             return homogeneous[:, :2] / homogeneous[:, 2:3], points[:, 2]
 
 
-def parse_key_values(text: str, where: str | Path) -> dict[str, Array]:
-    """KITTI's `key: numbers` lines (also `key numbers`, as odometry prints them) as flat arrays.
-
-    Lines whose values are not numbers (`calib_time: 09-Jan-2012 ...`) are left out.
-    Raises DataError on a non-finite number.
-    """
-    found: dict[str, Array] = {}
-    for line in text.splitlines():
-        parts = line.replace(":", " ", 1).split()
-        if len(parts) < 2:
-            continue
-        try:
-            values = np.array([float(part) for part in parts[1:]])
-        except ValueError:
-            continue
-        if not np.isfinite(values).all():
-            raise DataError(where, f"finite numbers for {parts[0]}", "NaN or infinity")
-        found[parts[0]] = values
-    return found
-
-
-def _matrix(values: dict[str, Array], names: tuple[str, ...], shape: tuple[int, int], where: str | Path) -> Array:
-    """The matrix under the first of `names` that the file has."""
-    for name in names:
-        if name in values:
-            if values[name].size != shape[0] * shape[1]:
-                raise DataError(where, f"{shape[0] * shape[1]} numbers for {name}", f"{values[name].size}")
-            return values[name].reshape(shape)
-    have = ", ".join(sorted(values)) or "no key at all"
-    hint = "is this a calibration file of another KITTI benchmark or a label file? see docs/data.md"
-    raise DataError(where, f"a line '{names[0]}:'" + (f" (or {', '.join(names[1:])})" if names[1:] else ""), have, hint)
-
-
-def parse_calibration(text: str, where: str | Path = "calibration") -> Calibration:
+def parse_calibration(text: str, where: str | Path = "calibration", camera: int = 2) -> Calibration:
     """An object, tracking or odometry calibration file (one file with P2, R0_rect and Tr_velo_to_cam).
 
+    camera  whose images are used: 2 in KITTI; 0 for the front camera of Waymo's KITTI form (P0, Tr_velo_to_cam_0)
     Odometry files have no rectification line: their `Tr` maps to the rectified camera, so R0_rect is the identity.
     Raises DataError when a needed key is missing: nothing is guessed.
     """
     values = parse_key_values(text, where)
-    P2 = _matrix(values, ("P2",), (3, 4), where)
+    P2 = values.matrix((f"P{camera}",), (3, 4))
     odometry = "Tr" in values and not any(key in values for key in _RECTIFICATION_KEYS)
-    R0_rect = np.eye(3) if odometry else _matrix(values, _RECTIFICATION_KEYS, (3, 3), where)
-    T_cam0_velo = np.vstack([_matrix(values, _VELO_KEYS, (3, 4), where), [0, 0, 0, 1]])
-    P3 = _matrix(values, ("P3",), (3, 4), where) if "P3" in values else None
-    return Calibration(P2=P2, R0_rect=R0_rect, T_cam0_velo=T_cam0_velo, P3=P3)
+    R0_rect = np.eye(3) if odometry else values.matrix(_RECTIFICATION_KEYS, (3, 3))
+    names = (*_VELO_KEYS, f"{_VELO_KEYS[0]}_{camera}") if camera != 2 else _VELO_KEYS
+    T_cam0_velo = np.vstack([values.matrix(names, (3, 4)), [0, 0, 0, 1]])
+    P3 = values.matrix(("P3",), (3, 4)) if "P3" in values and camera == 2 else None
+    return _calibration(P2, R0_rect, T_cam0_velo, P3, where)
 
 
 def parse_raw_calibration(cam_to_cam: str, velo_to_cam: str, where: str | Path = "calibration") -> Calibration:
     """The two files of a raw drive: calib_cam_to_cam.txt (P_rect_02, R_rect_00), calib_velo_to_cam.txt (R, T)."""
     cameras, velodyne = parse_key_values(cam_to_cam, where), parse_key_values(velo_to_cam, where)
     T_cam0_velo = np.eye(4)
-    T_cam0_velo[:3, :3] = _matrix(velodyne, ("R",), (3, 3), where)
-    T_cam0_velo[:3, 3] = _matrix(velodyne, ("T",), (3, 1), where)[:, 0]
-    P3 = _matrix(cameras, ("P_rect_03",), (3, 4), where) if "P_rect_03" in cameras else None
-    return Calibration(
-        P2=_matrix(cameras, ("P_rect_02",), (3, 4), where),
-        R0_rect=_matrix(cameras, ("R_rect_00",), (3, 3), where),
-        T_cam0_velo=T_cam0_velo,
-        P3=P3,
-    )
+    T_cam0_velo[:3, :3] = velodyne.matrix(("R",), (3, 3))
+    T_cam0_velo[:3, 3] = velodyne.matrix(("T",), (3, 1))[:, 0]
+    P3 = cameras.matrix(("P_rect_03",), (3, 4)) if "P_rect_03" in cameras else None
+    P2, R0_rect = cameras.matrix(("P_rect_02",), (3, 4)), cameras.matrix(("R_rect_00",), (3, 3))
+    return _calibration(P2, R0_rect, T_cam0_velo, P3, where)
 
 
-def read_calibration(path: str | Path) -> Calibration:
+def _calibration(P2: Array, R0_rect: Array, T_cam0_velo: Array, P3: Array | None, where: str | Path) -> Calibration:
+    """A Calibration whose trouble names the file it was read from."""
+    try:
+        return Calibration(P2=P2, R0_rect=R0_rect, T_cam0_velo=T_cam0_velo, P3=P3)
+    except DataError as error:
+        name = error.where.removeprefix("calibration ").replace("T_cam0_velo", "Tr_velo_to_cam")
+        raise DataError(where, f"{error.expected} under {name}", error.found) from None
+
+
+def read_calibration(path: str | Path, camera: int = 2) -> Calibration:
     """A calibration file on disk; see `parse_calibration`."""
     path = Path(path)
-    return parse_calibration(read_text(path, "a calibration file"), path)
+    return parse_calibration(read_text(path, "a calibration file"), path, camera)
 
 
 def format_calibration(calibration: Calibration) -> str:

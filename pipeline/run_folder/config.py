@@ -42,6 +42,9 @@ class DataConfig(Section):
     name: str = Field(default="synthetic", description="kitti_object, ..., or synthetic (made by the synth stage)")
     root: str | None = Field(default=None, description="folder of the data set; synthetic data defaults to OUT/data")
     frames: str | None = Field(default=None, description="a:b (positions), a split file, or ids separated by commas")
+    columns: int | None = Field(
+        default=None, ge=3, le=64, description="float32 columns of .bin clouds, x y z intensity first; 4 when not given"
+    )
 
 
 class SynthConfig(LibrarySection):

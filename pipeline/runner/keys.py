@@ -48,7 +48,7 @@ def part_hash(frame: Frame, part: str, file_hash: Callable[[Path], str]) -> str:
         return "none"
     files = frame.files(part)
     if files and not any(path.is_dir() for path in files):
-        return ",".join(file_hash(path) for path in files)
+        return ",".join([*(file_hash(path) for path in files), *frame.forms(part)])
     try:
         value = getattr(frame, part)
     except DataError as error:

@@ -33,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--format", choices=FORMATS, metavar="NAME", help="format of PATH (found out when not given): "
                         f"{', '.join(FORMATS)}")  # fmt: skip
     parser.add_argument("--frames", metavar="FILE|a:b", help="split file, positions a:b or ids (all frames)")
+    parser.add_argument("--columns", type=int, metavar="N", help="float32 columns of the .bin clouds of a data set (4)")
     parser.add_argument("--workers", type=int, metavar="N", help="processes (all cores)")
     parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help="write the report as JSON (to the screen)")
     leakage = parser.add_argument_group("leakage: frames that share a raw drive with a model's training data")
@@ -59,9 +60,9 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("nothing to check: give a PATH or --data DIR")
     reference = None
     if args.path is not None and args.data is not None:
-        reference = open_checked(args.dataset or recognise(args.data), args.data)
+        reference = open_checked(args.dataset or recognise(args.data), args.data, args.columns)
     format_name = args.format or (args.dataset if args.path is None else None)
-    report = check(path, format_name, reference, args.frames, args.workers)
+    report = check(path, format_name, reference, args.frames, args.workers, columns=args.columns)
     _show(args.json, report.as_dict(), list(report.lines()))
     return 0 if report.clean else 1
 

@@ -40,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--dataset", default="kitti_object", choices=list(READERS), metavar="NAME", help="its layout "
                         f"(kitti_object): {', '.join(READERS)}")  # fmt: skip
+    parser.add_argument("--columns", type=int, metavar="N", help="float32 columns of its .bin clouds (4)")
     parser.add_argument("--run", type=Path, metavar="DIR", help="run folder with depth/, cloud/, detections/")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="output folder")
     parser.add_argument("--frames", metavar="FILE|a:b", help="split file, positions a:b or ids (all frames)")
@@ -61,7 +62,9 @@ def run(args: argparse.Namespace) -> int:
 
     if args.run is not None and not args.run.is_dir():
         raise UsageError(f"no such run folder: {args.run}")
-    dataset = open_dataset(args.dataset, args.data)
+    dataset = open_dataset(args.dataset, args.data, args.columns)
+    if dataset.refusal:
+        raise UsageError(dataset.refusal)
     if args.frames:
         dataset = dataset.select(args.frames)
     elif args.run is not None:
