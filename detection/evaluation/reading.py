@@ -276,7 +276,7 @@ def read_table(
 
     files  frame -> file name, where it is not FRAME.txt
     Raises InputError (unless lenient) with file, line and column of the first broken line; also when lenient, if no
-    line of the folder can be read.
+    line of a label folder can be read: it would pass for one without objects.
     """
     width = 15 if scored else 14
     counts, lines, names, longer = [], [], [], []
@@ -299,7 +299,7 @@ def read_table(
                 longer.append(len(fields))
         counts.append(kept)
     broken = [message for kind, message in problems.found[passed_over:] if kind == BROKEN_LINE]
-    if broken and not names:
+    if broken and not names and not scored:
         raise InputError(f"{folder}: none of {len(broken)} lines can be read; the first: {broken[0]}")
     if longer:
         problems.notes.append(_about_columns(folder, longer, width + 1, len(names)))

@@ -120,7 +120,8 @@ def _by_values(samples: Sequence[NDArray[np.floating]]) -> int | None:
 
 def _quantile_bins(values: NDArray[np.floating]) -> NDArray[np.int64]:
     """The values as bins of about equal counts, empty returns (x y z intensity all 0) left out when there are many."""
-    whole = np.asarray(values, dtype=np.float64)
+    with np.errstate(invalid="ignore"):  # damaged files hold signalling NaN
+        whole = np.asarray(values, dtype=np.float64)
     rows = whole[: len(whole) // 4 * 4].reshape(-1, 4)
     empty = (rows == 0).all(axis=1)
     if len(rows) and empty.mean() > _MANY_EMPTY:

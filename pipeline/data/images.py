@@ -19,6 +19,7 @@ JPEG_SIGNATURE = b"\xff\xd8"
 # Larger than any camera of the field; a header that claims more is damage, and is refused before memory is taken.
 MAX_PIXELS = 64_000_000
 # JPEG markers that hold the frame size (SOF0-SOF15 without DHT, JPG, DAC); ITU-T T.81 table B.1.
+_END_OF_IMAGE = 0xD9
 _SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
@@ -32,10 +33,24 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
     path = Path(path)
     data = read_bytes(path, "a PNG or JPEG image")
     check_complete(data, path)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    # Pixels belong to the calibration as they are stored: an EXIF orientation is for viewers.
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_ANYDEPTH)
     if image is None:
         raise DataError(path, "a PNG or JPEG image", "data that cannot be decoded")
+    if image.dtype == np.uint16:
+        image = _eight_bits(image, path)
     return np.ascontiguousarray(image[:, :, ::-1])
+
+
+def _eight_bits(image: NDArray[Any], path: Path) -> NDArray[np.uint8]:
+    """The upper 8 of 16 bits. Raises DataError when nothing uses them: sensors give 10 to 14 bits."""
+    largest = int(image.max())
+    if 255 < largest < 2**14:
+        bits = largest.bit_length()
+        hint = f"multiply by {2 ** (16 - max(bits, 10))}, or store 8-bit pixels"
+        raise DataError(path, "pixels of 8 or 16 bits", f"{bits}-bit data in a 16-bit file (largest {largest})", hint)
+    return np.asarray(image >> 8 if largest > 255 else image, dtype=np.uint8)
 
 
 def read_unchanged(path: str | Path, what: str) -> NDArray[Any]:
@@ -72,7 +87,7 @@ def check_complete(data: bytes, path: Path) -> None:
             raise DataError(path, "a complete PNG image", f"a file that ends after {len(data)} bytes", _TRUNCATED)
     elif data.startswith(JPEG_SIGNATURE):
         _jpeg_size(data, path)
-        if not data.rstrip(b"\0").endswith(b"\xff\xd9"):
+        if not _jpeg_ends(data):
             raise DataError(path, "a complete JPEG image", f"a file that ends after {len(data)} bytes", _TRUNCATED)
     else:
         raise DataError(path, "a PNG or JPEG image", f"a file starting with {data[:4]!r}")
@@ -117,6 +132,28 @@ def _jpeg_size(data: bytes, path: Path) -> tuple[int, int]:
             continue
         position += 2 + struct.unpack_from(">H", data, position + 2)[0]
     raise DataError(path, "a PNG or JPEG image", f"a file starting with {data[:4]!r} without an image size")
+
+
+def _jpeg_ends(data: bytes) -> bool:
+    """True when the image has its end marker; what cameras append behind it does not matter (ITU-T T.81 B.1.1)."""
+    position, length = 2, len(data)
+    while position + 1 < length:
+        position = data.find(b"\xff", position)
+        if position < 0 or position + 1 >= length:
+            return False
+        marker = data[position + 1]
+        if marker == _END_OF_IMAGE:
+            return True
+        # Fill bytes, stuffed zeros and restart markers are followed by no length; segments (thumbnails in them) are.
+        if marker == 0xFF:
+            position += 1
+        elif marker in (0x00, 0x01) or 0xD0 <= marker <= 0xD8:
+            position += 2
+        elif position + 4 > length:
+            return False
+        else:
+            position += 2 + struct.unpack_from(">H", data, position + 2)[0]
+    return False
 
 
 def _sane_size(height: int, width: int, path: Path) -> tuple[int, int]:

@@ -53,7 +53,6 @@ def test_fractional_truncation_and_occlusion_are_kept(folders: tuple[Path, Path]
     ("line", "words"),
     [
         (" ".join(FOUND.split()[:-1]), r"000001\.txt:2: expected 16 columns, got 15; a result line needs a score"),
-        (FOUND + " 7", r"000001\.txt:2: expected 16 columns, got 17"),
         (FOUND.replace("1.6000", "1,6"), r"000001\.txt:2: column '\w+' is not a number: '1,6'"),
         (FOUND.replace("0.500000", "nan"), r"000001\.txt:2: column 'score' is nan"),
         (FOUND.replace("20.0000", "inf"), r"000001\.txt:2: column 'z' is inf"),
@@ -71,9 +70,30 @@ def test_a_broken_line_is_named_or_counted(folders: tuple[Path, Path], line: str
 
 
 def test_a_broken_label_is_named(folders: tuple[Path, Path]) -> None:
-    (folders[0] / "000002.txt").write_text(FOUND)
-    with pytest.raises(InputError, match=r"label_2.000002\.txt:1: expected 15 columns, got 16"):
+    (folders[0] / "000002.txt").write_text(LABEL.rsplit(" ", 1)[0])
+    with pytest.raises(InputError, match=r"label_2.000002\.txt:1: expected 15 columns, got 14"):
         evaluate(*folders)
+
+
+@pytest.mark.parametrize("columns", [16, 17, 18])
+def test_columns_that_the_devkit_does_not_read_are_not_read(folders: tuple[Path, Path], columns: int) -> None:
+    expected = evaluate(*folders)
+    for folder, width in zip(folders, (15, 16)):
+        for path in folder.glob("*.txt"):
+            path.write_text("\n".join(line + " 0" * (columns - width) for line in path.read_text().splitlines()))
+    report = evaluate(*folders)
+    assert report["results"] == expected["results"]
+    notes = [text for text in report["warnings"] if "columns" in text]
+    assert len(notes) == (1 if columns == 16 else 2)
+    assert f"lines have {columns} columns; the devkit and we read the first 15" in notes[0]
+    assert evaluate(*folders, lenient=True)["results"] == expected["results"]
+
+
+def test_labels_of_which_no_line_can_be_read_are_not_called_empty(folders: tuple[Path, Path]) -> None:
+    for path in folders[0].iterdir():
+        path.write_text("Car 0 0\n")
+    with pytest.raises(InputError, match=r"label_2: none of 3 lines can be read; the first: .*got 3"):
+        evaluate(*folders, lenient=True)
 
 
 def test_a_missing_file_is_named_skipped_or_empty(folders: tuple[Path, Path]) -> None:
