@@ -85,7 +85,7 @@ def test_columns_that_the_devkit_does_not_read_are_not_read(folders: tuple[Path,
     assert report["results"] == expected["results"]
     notes = [text for text in report["warnings"] if "columns" in text]
     assert len(notes) == (1 if columns == 16 else 2)
-    assert f"lines have {columns} columns; the devkit and we read the first 15" in notes[0]
+    assert f"lines have {columns} columns; the first 15 are read" in notes[0]
     assert evaluate(*folders, lenient=True)["results"] == expected["results"]
 
 
