@@ -41,6 +41,7 @@ class Comparison:
     tall_cars: int = 0
     all_cars: int = 0
     label_columns: dict[str, int] = field(default_factory=dict)
+    empty_points: dict[str, int] = field(default_factory=dict)
     gains: dict[str, tuple[float, ...]] = field(default_factory=dict)
     scores: dict[str, dict[int, float]] = field(default_factory=dict)
     window: deque[tuple[str, Structure | None]] = field(default_factory=deque)
@@ -61,6 +62,7 @@ class Comparison:
         self.tall_cars += facts.cars[0]
         self.all_cars += facts.cars[1]
         self.label_columns[facts.frame] = facts.label_columns
+        self.empty_points[facts.frame] = facts.empty_points
         if facts.gains:
             self.gains[facts.frame] = facts.gains
         self._compare(facts)
@@ -95,10 +97,16 @@ class Comparison:
 
     def notes(self) -> list[str]:
         """What the frames have that is taken though the layout has it otherwise."""
+        found = []
         wide = [columns for columns in self.label_columns.values() if columns > 15]
-        if not wide:
-            return []
-        return [f"{self.root}: {len(wide)} label files have up to {max(wide)} columns; the first 15 are read"]
+        if wide:
+            found.append(f"{self.root}: {len(wide)} label files have up to {max(wide)} columns; the first 15 are read")
+        empty = [count for count in self.empty_points.values() if count]
+        if empty:
+            found.append(
+                f"{self.root}: {sum(empty)} points without a return (NaN or 0 0 0) are left out of {len(empty)} clouds"
+            )
+        return found
 
     def _missing(self) -> Iterator[Finding]:
         counts = Counter(part for parts in self.present.values() for part in parts)

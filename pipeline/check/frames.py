@@ -24,6 +24,7 @@ from pipeline.check.faults import Finding
 from pipeline.check.images import CROP_SHIFTS, Structure, colours_swapped, shift_gains, structure
 from pipeline.check.labels import check_objects, read_objects, wide_lines
 from pipeline.data.cloud_columns import CloudForm
+from pipeline.data.cloud_files import read_measured
 from pipeline.data.frame import Frame
 from pipeline.export.geometry import boxes_in_lidar, points_in_box
 from pipeline.geometry.calibration import Calibration
@@ -77,6 +78,7 @@ class FrameFacts:
     gains: tuple[float, ...] = ()
     cars: tuple[int, int] = (0, 0)
     label_columns: int = 0
+    empty_points: int = 0
 
 
 @dataclass
@@ -90,6 +92,7 @@ class _Parts:
     calibration: Calibration | None = None
     points: Points | None = None
     objects: list[KittiObject] = field(default_factory=list)
+    empty: int = 0
 
     def where(self, part: str) -> str:
         path = source_path(self.frame, part)
@@ -163,6 +166,7 @@ def examine_frame(open_frame: Callable[[str], Frame], place: Place) -> FrameFact
         gains=gains,
         cars=(sum(o.size[0] > o.size[1] for o in cars), len(cars)),
         label_columns=_label_columns(frame),
+        empty_points=parts.empty,
     )
 
 
@@ -240,6 +244,9 @@ def _read_cloud(parts: _Parts) -> None:
     if path is not None and path.suffix.lower() == ".bin" and path.is_file():
         points, found = read_raw_cloud(path, _argument(frame, "points", CloudForm(), CloudForm), frame.id)
         parts.findings += found
+    elif path is not None and path.suffix.lower() in (".ply", ".pcd"):
+        form = _argument(frame, "points", CloudForm(), CloudForm)
+        points, parts.empty = parts.load("points", partial(read_measured, path, form)) or (None, 0)
     else:
         points = parts.load("points")
     if points is None:

@@ -26,23 +26,21 @@ READERS: dict[str, Callable[[Path], Dataset]] = {
     "nyuv2": open_nyuv2,
     "folder": open_folder,
 }
-# Those that also take the number of columns of their clouds.
-_WITH_COLUMNS: dict[str, Callable[[Path, int | None], Dataset]] = {
-    "kitti_object": open_kitti_object,
-    "folder": open_folder,
-}
 
 
-def open_dataset(name: str, root: str | Path, columns: int | None = None) -> Dataset:
+def open_dataset(name: str, root: str | Path, columns: int | None = None, keep_empty: bool = False) -> Dataset:
     """The data set `name` (a key of READERS) in the folder `root`.
 
-    columns  float32 numbers per point of .bin clouds, when they are not x y z intensity
+    columns     float32 numbers per point of .bin clouds, when they are not x y z intensity
+    keep_empty  keep points without a return of PLY and PCD files (`folder` only)
     Raises UsageError for an unknown name, a missing folder or a folder without frames.
     """
     if name not in READERS:
         raise UsageError(f"unknown data set {name!r}; known: {', '.join(READERS)}")
-    if columns is None:
-        return READERS[name](Path(root))
-    if name not in _WITH_COLUMNS:
-        raise UsageError(f"data.columns={columns}: {name} has clouds of one form; known for {', '.join(_WITH_COLUMNS)}")
-    return _WITH_COLUMNS[name](Path(root), columns)
+    if name == "folder":
+        return open_folder(root, columns, keep_empty)
+    if name == "kitti_object":
+        return open_kitti_object(root, columns)
+    if columns is not None:
+        raise UsageError(f"data.columns={columns}: {name} has clouds of one form; for kitti_object and folder only")
+    return READERS[name](Path(root))

@@ -31,16 +31,18 @@ _SAMPLED_FILES, _SAMPLED_BYTES = 6, 240_240 * 4  # divisible by every candidate
 
 @dataclass(frozen=True)
 class CloudForm:
-    """The row length of a folder's .bin clouds.
+    """How the clouds of a folder are read.
 
     columns  float32 numbers per point that are read
     fits     the number that the files show; another one than `columns` is an error unless it was asked for
     asked    True when the user set `columns`
+    keep_empty  True: points of PLY and PCD files without a return (0 0 0) are kept, and NaN is refused
     """
 
     columns: int = KITTI_COLUMNS
     fits: int = KITTI_COLUMNS
     asked: bool = False
+    keep_empty: bool = False
 
     @property
     def refusal(self) -> str:

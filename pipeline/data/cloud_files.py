@@ -18,6 +18,7 @@ from pipeline.base.errors import DataError
 from pipeline.data.bin_clouds import read_velodyne
 from pipeline.data.cloud_columns import CloudForm
 from pipeline.data.images import read_bytes
+from pipeline.data.pcd import parse_header, read_data
 
 SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
 _PLY_TYPES = {
@@ -38,6 +39,8 @@ _PLY_TYPES = {
     "double": "f8",
     "float64": "f8",
 }
+# Names of the intensity in small letters, of which the first that a file has counts.
+INTENSITY_NAMES = ("intensity", "scalar_intensity", "reflectivity", "reflectance", "remission", "remissions", "i")
 # A header longer than this is not a header.
 _MAX_HEADER = 65536
 _KITTI = CloudForm()
@@ -60,19 +63,33 @@ class Cloud:
 
 
 def read_points(path: str | Path, form: CloudForm = _KITTI) -> NDArray[np.float32]:
-    """(N, 4) float32 x y z intensity of a .bin, .npy, .ply or .pcd file; intensity 0 when the file has none."""
+    """(N, 4) float32 x y z intensity of a .bin, .npy, .ply or .pcd file; intensity 0 when the file has none.
+
+    Pixels of organised PLY and PCD clouds without a return (NaN, or 0 0 0) are left out, unless `form` keeps them;
+    then NaN is refused.
+    """
     path = Path(path)
     if path.suffix.lower() == ".bin":
         return read_velodyne(path, form)
-    cloud = read_cloud(path)
-    wanted = [cloud.column(name) for name in ("x", "y", "z")]
-    intensity = next((name for name in ("intensity", "reflectance", "i") if name in cloud.columns), None)
-    wanted.append(cloud.column(intensity) if intensity else np.zeros(len(cloud.values), np.float32))
-    points = np.column_stack(wanted).astype(np.float32)
+    points, _ = read_measured(path, form)
     if not np.isfinite(points).all():
         bad = int((~np.isfinite(points)).any(axis=1).sum())
         raise DataError(path, "finite points", f"{bad} of {len(points)} points with NaN or infinite values")
     return points
+
+
+def read_measured(path: Path, form: CloudForm = _KITTI) -> tuple[NDArray[np.float32], int]:
+    """(N, 4) x y z intensity of a .npy, .ply or .pcd file, and how many points without a return were left out."""
+    cloud = read_cloud(path)
+    small = [name.lower() for name in cloud.columns]
+    wanted = [cloud.values[:, small.index(name)] for name in ("x", "y", "z")]
+    intensity = next((small.index(name) for name in INTENSITY_NAMES if name in small), None)
+    wanted.append(np.zeros(len(cloud.values), np.float32) if intensity is None else cloud.values[:, intensity])
+    points = np.column_stack(wanted).astype(np.float32)
+    if path.suffix.lower() == ".npy" or form.keep_empty:
+        return points, 0
+    empty = np.isnan(points[:, :3]).any(axis=1) | (points[:, :3] == 0).all(axis=1)
+    return np.ascontiguousarray(points[~empty]), int(empty.sum())
 
 
 def read_cloud(path: str | Path) -> Cloud:
@@ -91,7 +108,7 @@ def read_cloud(path: str | Path) -> Cloud:
         if isinstance(error, DataError):
             raise
         raise DataError(path, f"a whole {path.suffix} header", f"words that make none ({error})") from None
-    if cloud.columns[:3] != ("x", "y", "z") and not {"x", "y", "z"} <= set(cloud.columns):
+    if not {"x", "y", "z"} <= {name.lower() for name in cloud.columns}:
         raise DataError(path, "columns x y z", ", ".join(cloud.columns))
     return cloud
 
@@ -138,18 +155,22 @@ def _header(data: bytes, last: bytes, path: Path) -> tuple[list[str], int]:
 
 def _read_ply(data: bytes, path: Path) -> Cloud:
     lines, offset = _header(data, b"end_header", path)
-    count, names, types, kind, element = 0, [], [], "", ""
+    count, kind, element = 0, "", ""
+    names: list[str] = []
+    types: list[str] = []
     for words in (line.split() for line in lines):
         if words[:1] == ["format"]:
             kind = words[1]
         elif words[:1] == ["element"]:
             element = words[1]
+            if element != "vertex" and not names:
+                raise DataError(path, "the vertices first", f"element {element}")
             count = int(words[2]) if element == "vertex" else count
         elif words[:1] == ["property"] and element == "vertex":
-            if words[1] not in _PLY_TYPES:
+            if words[1].lower() not in _PLY_TYPES:
                 raise DataError(path, "number properties of the vertices", " ".join(words))
             names.append(words[-1])
-            types.append(_PLY_TYPES[words[1]])
+            types.append(_PLY_TYPES[words[1].lower()])
     order = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}.get(kind)
     if order is None or not names:
         raise DataError(path, "a PLY file with vertices", f"format {kind or 'unknown'} with {len(names)} properties")
@@ -158,17 +179,8 @@ def _read_ply(data: bytes, path: Path) -> Cloud:
 
 def _read_pcd(data: bytes, path: Path) -> Cloud:
     lines, offset = _header(data, b"DATA ", path)
-    header = {words[0]: words[1:] for words in (line.split() for line in lines) if words and words[0] != "#"}
-    try:
-        names, kind, count = header["FIELDS"], header["DATA"][0], int(header["POINTS"][0])
-        letters = {"F": "f", "I": "i", "U": "u"}
-        types = [f"<{letters[t]}{int(s)}" for t, s in zip(header["TYPE"], header["SIZE"])]
-        repeats = [int(word) for word in header.get("COUNT", ["1"] * len(names))]
-    except (KeyError, IndexError, ValueError) as error:
-        raise DataError(path, "a PCD header (FIELDS SIZE TYPE COUNT POINTS DATA)", f"trouble with {error}") from None
-    if kind not in ("ascii", "binary") or any(repeat != 1 for repeat in repeats):
-        raise DataError(path, "PCD data 'ascii' or 'binary' with one value per field", f"{kind}, COUNT {repeats}")
-    return _table(data[offset:], count, names, types, kind == "ascii", path)
+    values, names = read_data(parse_header(lines, path), data[offset:], path)
+    return Cloud(values, tuple(names))
 
 
 def _table(data: bytes, count: int, names: list[str], types: list[str], text: bool, path: Path) -> Cloud:

@@ -11,6 +11,7 @@ ROOT/semantics/ID.png     8-bit Cityscapes trainIds                   ROOT/insta
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,10 +40,11 @@ _LAYOUT: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 
 
-def open_folder(root: str | Path, columns: int | None = None) -> Dataset:
+def open_folder(root: str | Path, columns: int | None = None, keep_empty: bool = False) -> Dataset:
     """Frames of a user's folder, one per file in images/, sorted by name.
 
-    columns  float32 numbers per point of .bin clouds; None: 4, unless the clouds show another number (refused)
+    columns     float32 numbers per point of .bin clouds; None: 4, unless the clouds show another number (refused)
+    keep_empty  keep points of PLY and PCD files without a return (0 0 0), and refuse NaN; else they are left out
     Raises UsageError when there is no images/ folder or no image in it.
     """
     folder = Path(root)
@@ -51,7 +53,7 @@ def open_folder(root: str | Path, columns: int | None = None) -> Dataset:
     if not index.ids:
         raise UsageError(f"{folder}: no image found (expected images/ID.png or .jpg, points/ID.bin and calib.txt)")
     clouds = [folder / "points" / n for n in parts["points"].stems().values() if n.lower().endswith(".bin")]
-    form = cloud_form(clouds, columns)
+    form = replace(cloud_form(clouds, columns), keep_empty=keep_empty)
     opener = partial(open_frame, folder, index.parts, form)
     return as_dataset(index, Dataset(index.ids, opener, "folder", str(folder), refusal=form.refusal_of(folder)))
 

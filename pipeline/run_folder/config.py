@@ -45,6 +45,9 @@ class DataConfig(Section):
     columns: int | None = Field(
         default=None, ge=3, le=64, description="float32 columns of .bin clouds, x y z intensity first; 4 when not given"
     )
+    keep_empty: bool = Field(
+        default=False, description="keep points of PLY and PCD clouds without a return (0 0 0), and refuse NaN"
+    )
 
 
 class SynthConfig(LibrarySection):

@@ -41,7 +41,7 @@ def open_frames(config: Config, run: RunFolder) -> Dataset:
     A name like `val` finds ROOT/ImageSets/val.txt. Raises UsageError when there is no frame.
     """
     root = data_root(config, run)
-    dataset = open_dataset(reader_name(config), root, config.data.columns)
+    dataset = open_dataset(reader_name(config), root, config.data.columns, config.data.keep_empty)
     if dataset.refusal:
         raise UsageError(dataset.refusal)
     frames = config.data.frames
