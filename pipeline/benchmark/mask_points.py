@@ -21,14 +21,15 @@ from pipeline.benchmark.visibility import visible_points
 from pipeline.data import Dataset, Frame
 from pipeline.geometry.in_view import lidar_pixels
 from pipeline.geometry.rings import split_rings
+from pipeline.semantics.conventions import GROUPS
 from pipeline.semantics.sources import SemanticsSource
 
 Mask = NDArray[np.bool_]
 
-# What is compared -> KITTI's types of box, Cityscapes trainIds.
-GROUPS = {
-    "vehicles": (("Car", "Van", "Truck", "Tram"), (13, 14, 15, 16)),
-    "people": (("Pedestrian", "Person_sitting", "Cyclist"), (11, 12, 17, 18)),
+# Groups of classes -> KITTI's types of box.
+TYPES = {
+    "vehicles": ("Car", "Van", "Truck", "Tram"),
+    "people": ("Pedestrian", "Person_sitting", "Cyclist"),
 }
 # A box reaches down to the road, whose points in it are not the object's. Metres.
 ABOVE_ROAD = 0.2
@@ -85,8 +86,8 @@ def count_points(frame: Frame, semantics: NDArray[np.uint8]) -> dict[str, PointC
     row, column = np.divmod(lidar_pixels(seen, frame.calibration, frame.image_size), frame.image_size[1])
     classes, left_out = semantics[row, column], _in_regions(column, row, frame.labels)
     counts = {}
-    for group, (types, train_ids) in GROUPS.items():
-        boxes = boxes_of(item for item in frame.labels if item.type in types).values
+    for group, train_ids in GROUPS.items():
+        boxes = boxes_of(item for item in frame.labels if item.type in TYPES[group]).values
         inside = points_in_boxes(camera, boxes).any(axis=0)
         boxes[:, 1] -= ABOVE_ROAD
         boxes[:, 3] -= ABOVE_ROAD

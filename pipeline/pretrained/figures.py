@@ -131,8 +131,8 @@ def recall_at(labels: Objects, found: Objects, threshold: float) -> dict[str, fl
 
 def segmentation_figures(weights: Path, dataset: Dataset) -> dict[str, Any]:
     """Share of pixels with the right class, and IoU of vehicles (car, truck, bus), over all frames."""
+    from pipeline.semantics.checkpoints import load_segmenter
     from pipeline.semantics.conventions import CLASSES, NONE
-    from pipeline.semantics.network import load_segmenter
 
     segmenter = load_segmenter(weights)
     vehicles = [CLASSES.index(name) for name in ("car", "truck", "bus")]

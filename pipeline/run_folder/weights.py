@@ -6,6 +6,7 @@ from pathlib import Path
 
 from pipeline.base.errors import UsageError
 from pipeline.run_folder.config import Config
+from pipeline.semantics.sources import network_choice
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
@@ -49,11 +50,10 @@ def detector_name(config: Config) -> str:
 
 
 def mask_weights(source: str) -> tuple[Path, ...]:
-    """Files of the segmentation model that `augment.semantics` names: network or soft[:WEIGHTS], onnx:FILE,
-    hf:FOLDER."""
+    """Files of the segmentation model that `augment.semantics` names: network or soft, onnx:FILE, hf:FOLDER."""
     kind, _, place = source.partition(":")
     if kind in ("network", "soft"):
-        return _files("pipeline/semantics", place or "street-small", "augment.semantics")
+        return _files("pipeline/semantics", network_choice(place)[0], "augment.semantics")
     if kind == "onnx":
         return (Path(place),)
     if kind == "hf":

@@ -38,6 +38,8 @@ CLASSES = (
     "motorcycle",
     "bicycle",
 )
+# What masks are compared and thresholded by: everything on four wheels or rails; people and what they ride.
+GROUPS = {"vehicles": (13, 14, 15, 16), "people": (11, 12, 17, 18)}
 # Cityscapes labelIds in the order of trainIds.
 LABEL_IDS = (7, 8, 11, 12, 13, 17, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 31, 32, 33)
 VKITTI2_COLORS = {

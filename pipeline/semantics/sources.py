@@ -15,10 +15,10 @@ from detection.kitti_format import KittiObject
 from pipeline.base.errors import DataError, UsageError
 from pipeline.data.frame import Frame
 from pipeline.data.images import read_unchanged
-from pipeline.semantics.conventions import NONE, to_train_ids
+from pipeline.semantics.conventions import GROUPS, NONE, to_train_ids
 
 if TYPE_CHECKING:
-    from pipeline.semantics.network import NetworkSegmenter
+    from pipeline.semantics.inference import NetworkSegmenter
 
 # KITTI type -> Cityscapes trainId.
 KITTI_CLASSES = {
@@ -30,6 +30,10 @@ KITTI_CLASSES = {
     "Person_sitting": 11,
     "Cyclist": 12,
 }
+
+
+# The bundled network of "network" and "soft" without a name.
+DEFAULT_WEIGHTS = "street-small"
 
 
 class SemanticsSource(Protocol):
@@ -108,7 +112,8 @@ class SoftMasks:
 def open_semantics(source: str, convention: str | None = None) -> SemanticsSource:
     """The source a setting names: truth, boxes, files:FOLDER, network[:WEIGHTS], soft[:WEIGHTS], onnx:FILE, hf:FOLDER.
 
-    "soft" gives the network's scores of vehicles, pedestrians and cyclists instead of labels.
+    "soft" gives the network's scores of vehicles, pedestrians and cyclists instead of labels. The scores from which
+    "network" calls a pixel a vehicle or a person follow its name: network:WEIGHTS:vehicles=0.7:people=0.3.
 
     convention  of the labels in files or of an ONNX model's output; a folder may hold it in mask.json instead
 
@@ -119,15 +124,8 @@ def open_semantics(source: str, convention: str | None = None) -> SemanticsSourc
         return TrueClasses()
     if kind == "boxes":
         return TrueBoxes()
-    if kind == "network":
-        from pipeline.semantics.network import load_segmenter
-
-        return ModelMasks(load_segmenter(place or "street-small"))
-    if kind == "soft":
-        from pipeline.pointcloud.semantic_mask import OBJECTS
-        from pipeline.semantics.network import load_segmenter
-
-        return SoftMasks(load_segmenter(place or "street-small"), OBJECTS)
+    if kind in ("network", "soft"):
+        return _own_network(kind, place)
     if place and kind == "files":
         return MaskFolder(Path(place), _stated_convention(Path(place), convention))
     if place and kind == "onnx":
@@ -140,6 +138,37 @@ def open_semantics(source: str, convention: str | None = None) -> SemanticsSourc
         return ModelMasks(HuggingFaceSegmenter(place))
     kinds = "truth, boxes, files:FOLDER, network, soft, onnx:FILE or hf:FOLDER"
     raise UsageError(f"semantics: expected {kinds}, got {source!r}")
+
+
+def network_choice(place: str) -> tuple[str, dict[str, float]]:
+    """WEIGHTS and thresholds of "WEIGHTS:vehicles=0.7:people=0.3"; any part may be missing.
+
+    Raises UsageError for a threshold that is no number.
+    """
+    parts = place.split(":")
+    # Only names of groups have an equals sign behind them; a colon may also belong to a path.
+    named = [part for part in parts if part.partition("=")[0] in GROUPS]
+    weights = ":".join(part for part in parts if part not in named)
+    try:
+        thresholds = {group: float(value) for group, _, value in (part.partition("=") for part in named)}
+    except ValueError:
+        raise UsageError(f"semantics: expected scores like vehicles=0.7, got {':'.join(named)!r}") from None
+    return weights or DEFAULT_WEIGHTS, thresholds
+
+
+def _own_network(kind: str, place: str) -> SemanticsSource:
+    """Labels ("network") or scores ("soft") of our network. Raises UsageError for thresholds that do not fit."""
+    from pipeline.pointcloud.semantic_mask import OBJECTS
+    from pipeline.semantics.checkpoints import load_segmenter
+
+    weights, thresholds = network_choice(place)
+    if kind == "soft" and thresholds:
+        raise UsageError("semantics: soft masks have one threshold, augment.mask.threshold; got " + repr(thresholds))
+    try:
+        model = load_segmenter(weights, thresholds)
+    except ValueError as error:
+        raise UsageError(f"semantics: {error}") from None
+    return ModelMasks(model) if kind == "network" else SoftMasks(model, OBJECTS)
 
 
 def boxes_to_semantics(labels: Sequence[KittiObject], image_size: tuple[int, int]) -> NDArray[np.uint8]:

@@ -20,8 +20,10 @@ from auglidar_base.atomic import write_text
 from completion.resume import load_state, save_state
 from completion.samples import Augmentation, disturb_image
 from completion.train import TrainProgress
+from pipeline.semantics.checkpoints import save_segmenter
 from pipeline.semantics.conventions import CLASSES, NONE
-from pipeline.semantics.network import LabelledImage, StreetSegmenter, image_tensor, save_segmenter
+from pipeline.semantics.network import StreetSegmenter
+from pipeline.semantics.pictures import LabelledImage, image_tensor
 
 LOG_EVERY = 50
 

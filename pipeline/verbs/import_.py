@@ -12,6 +12,9 @@ from typing import Any
 from detection.kitti_format import KittiObject
 from pipeline.base.errors import DataError, UsageError
 
+# The published network whose features the segmentation network of `pipeline.semantics.pyramid` stands on.
+BACKBONE = "efficientnet_lite0"
+
 EXAMPLES = """\
 examples:
   run_pipeline --stage import TWISE.tar --architecture twise \\
@@ -29,7 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         metavar="NAME",
         help="twise, twise_maxpool, msg_chn, msg_chn_wacv, sparse_to_dense; pointrcnn, epnet, openpcdet_pointrcnn, "
-        "pointpillar, second, voxel_rcnn, pv_rcnn; or 'results' for a result.pkl",
+        "pointpillar, second, voxel_rcnn, pv_rcnn; efficientnet_lite0 (backbone to train a segmentation network on); "
+        "or 'results' for a result.pkl",
     )
     out = "NAME.safetensors, or the folder of result files"
     parser.add_argument("--out", type=Path, required=True, metavar="FILE|DIR", help=out)
@@ -60,7 +64,7 @@ def import_weights(path: Path, architecture: str, out: Path) -> Path:
     from completion.importers import ARCHITECTURES
     from detection.models.presets import IMPORTED_PRESETS
 
-    known = (*ARCHITECTURES, *IMPORTED_PRESETS)
+    known = (*ARCHITECTURES, *IMPORTED_PRESETS, BACKBONE)
     if architecture not in known:
         raise UsageError(f"unknown architecture {architecture!r}; known: {', '.join(known)}, results")
     try:
@@ -68,9 +72,29 @@ def import_weights(path: Path, architecture: str, out: Path) -> Path:
             from completion.checkpoints import convert_checkpoint
 
             return convert_checkpoint(path, architecture, out)
+        if architecture == BACKBONE:
+            return _import_backbone(path, out)
         return _import_detector(path, architecture, out)
     except ValueError as error:
         raise DataError(path, f"a checkpoint of {architecture}", str(error)) from None
+
+
+def _import_backbone(path: Path, out: Path) -> Path:
+    """A segmentation network with the published backbone and a pyramid that has learned nothing yet."""
+    import torch
+
+    from auglidar_base.torch_pickle import read_torch_pickle
+    from pipeline.semantics.checkpoints import save_segmenter
+    from pipeline.semantics.efficientnet_lite import backbone_state
+    from pipeline.semantics.pyramid import PyramidSegmenter
+
+    state = backbone_state(read_torch_pickle(path))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = PyramidSegmenter()
+    model.backbone.load_state_dict(state)
+    source = {"imported_from": path.name, "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    return save_segmenter(model, out, source)
 
 
 def _import_detector(path: Path, architecture: str, out: Path) -> Path:

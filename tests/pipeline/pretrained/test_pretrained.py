@@ -18,7 +18,7 @@ from pipeline.pretrained.figures import AT_THRESHOLD, HeldOut, operating_point, 
 from pipeline.run_folder.config import load_config
 from pipeline.run_folder.weights import bundled_folder
 from pipeline.semantics.conventions import NONE
-from pipeline.semantics.network import NetworkSegmenter
+from pipeline.semantics.inference import NetworkSegmenter
 from pipeline.simulation.synth import SynthSettings
 from pipeline.simulation.writers import write_dataset
 

@@ -15,7 +15,9 @@ import torch
 from completion.train import TrainProgress
 from pipeline.base.errors import DataError
 from pipeline.semantics import training
-from pipeline.semantics.network import NetworkSegmenter, StreetSegmenter, load_segmenter, save_segmenter
+from pipeline.semantics.checkpoints import load_segmenter, save_segmenter
+from pipeline.semantics.inference import NetworkSegmenter
+from pipeline.semantics.network import StreetSegmenter
 from pipeline.semantics.onnx_model import OnnxSegmenter
 from pipeline.semantics.training import SegmentationSettings, train_segmenter
 
