@@ -23,7 +23,7 @@ from pipeline.verbs.parsers import STAGE_HELP, main_parser, verb_parser
 from tests.pipeline.tiny_kitti import write_tiny_kitti
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = sorted([*ROOT.glob("docs/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"])
+PAGES = sorted([*ROOT.glob("docs/*.md"), *ROOT.glob("[A-Z]*.md")])
 FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 ROOMS = ("auglidar_base", "completion", "detection", "pipeline", "benchmarks")
 
