@@ -1,6 +1,7 @@
 """Builds the documentation as a static site that opens without a server or a network: python scripts/build_docs.py
 
-docs/*.md, the notebooks, CONTRIBUTING.md, CHANGELOG.md and an API reference made from the docstrings go to build/docs;
+docs/*.md, the notebooks, CONTRIBUTING.md, CHANGELOG.md, RELEASING.md and an API reference made from the docstrings go
+to build/docs;
 Zensical (extra `docs`) turns them into site/. `--sources-only` stops before Zensical.
 """
 
@@ -97,9 +98,10 @@ def write_sources(out: Path) -> None:
     shutil.copytree(ROOT / "docs", out, ignore=shutil.ignore_patterns("*.py", "synthetic_statistics.md"))
     (out / "site.css").write_text(STYLE, encoding="utf-8")
     shutil.copy(ROOT / "scripts" / "iframe-worker.js", out)
-    for name in ("CONTRIBUTING", "CHANGELOG"):
+    for name in ("CONTRIBUTING", "CHANGELOG", "RELEASING"):
         text = (ROOT / f"{name}.md").read_text(encoding="utf-8")
-        (out / f"{name.lower()}.md").write_text(text.replace("(docs/", "("), encoding="utf-8")
+        text = text.replace("(docs/", "(").replace("(RELEASING.md)", "(releasing.md)")
+        (out / f"{name.lower()}.md").write_text(text, encoding="utf-8")
     results = (ROOT / "benchmarks" / "RESULTS.md").read_text(encoding="utf-8")
     head, tables = results.split("\n## ", 1)
     tables = re.sub(r"^(?![|#`!\s-])(.+)$", r"\1  ", tables, flags=re.MULTILINE)  # what was printed keeps its lines
