@@ -113,6 +113,25 @@ class Vkitti2Difficulty:
         return dict(zip((*LEVELS, "none"), found.tolist()))
 
 
+@dataclass(frozen=True)
+class AnyHeight:
+    """The rule of another with every height in the image: for results and labels without 2D boxes.
+
+    rule  decides by truncation and occlusion alone
+    """
+
+    rule: DifficultyRule
+
+    @property
+    def min_height(self) -> tuple[float, float, float]:
+        """No detection is too low."""
+        return (0.0, 0.0, 0.0)
+
+    def counts(self, height: Array, truncation: Array, occlusion: Array) -> Mask:
+        """(3, N) whether each label counts; its height (N,) is not looked at."""
+        return self.rule.counts(np.full_like(np.asarray(height, dtype=np.float64), np.inf), truncation, occlusion)
+
+
 def occlusion_from_fill(occupancy_ratio: Array, full_fill: float) -> Array:
     """(N,) occlusion 0..1 from Virtual KITTI 2's occupancy_ratio (N,), the share of the 2D box the object fills.
 

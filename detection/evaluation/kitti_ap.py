@@ -124,10 +124,21 @@ class Evaluation:
             "results": rows,
             "exact": [self._side_row(target, exact_ap) for target in self.targets if target.metric != "aos"],
             "recall": [self._side_row(target, found_share) for target in self.targets if target.metric != "aos"],
-            "warnings": [*matcher.pair.notes, *small_set_warnings(rows), *skipped_summary(problems)],
+            "warnings": [
+                *self._notes(),
+                *small_set_warnings(rows),
+                *skipped_summary(problems),
+            ],
             "skipped": {kind: sum(1 for found, _ in problems if found == kind) for kind, _ in problems},
             "protocol": self._choices_made(),
         }
+
+    def _notes(self) -> list[str]:
+        """What was read otherwise than written; a sentence when the numbers are no ranking by KITTI's rules."""
+        notes = list(self.matcher.pair.notes)
+        if self.protocol.min_height == "kitti":
+            return notes
+        return [*notes, "min_height none: objects of every height in the image count; this is not KITTI's ranking"]
 
     def _choices_made(self) -> dict[str, Any]:
         matcher = self.matcher
@@ -137,6 +148,7 @@ class Evaluation:
             "difficulty": str(matcher.difficulty),
             "range_rule": self.protocol.range_rule,
             "range_axis": self.protocol.range_axis,
+            "min_height": self.protocol.min_height,
             "frames": len(matcher.pair.frames),
             "labels": len(labels),
             "detections": len(matcher.pair.detections),

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-from detection.evaluation.difficulty import DifficultyRule, difficulty_named
+from detection.evaluation.difficulty import AnyHeight, DifficultyRule, difficulty_named
 
 Metric = Literal["2d", "aos", "bev", "3d"]
 IouSet = Literal["strict", "loose", "both"]
@@ -14,6 +14,7 @@ Flavor = Literal["cpp", "python"]
 RangeRule = Literal["clocs", "border"]
 RangeAxis = Literal["z", "radius"]
 RecallPoints = Literal[40, 11]
+MinHeight = Literal["kitti", "none"]
 
 METRICS: tuple[Metric, ...] = get_args(Metric)
 KITTI_CLASSES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
@@ -65,6 +66,8 @@ class EvaluationProtocol:
     range_axis  "z": depth along the optical axis; "radius": distance on the ground
     difficulty  "kitti", "vkitti2" (columns truncated and occluded hold ratios 0..1), "vkitti2:and:bands:ignore" and
                 the like (see Vkitti2Difficulty), or a DifficultyRule
+    min_height  "kitti": objects lower in the image than the difficulty asks are ignored; "none": every height counts,
+                also without 2D boxes (0 or -1), which is not KITTI's ranking
 
     Sequences of any kind are taken and kept as tuples. Raises ValueError for what cannot be asked.
     """
@@ -79,6 +82,7 @@ class EvaluationProtocol:
     range_rule: RangeRule = "clocs"
     range_axis: RangeAxis = "z"
     difficulty: str | DifficultyRule = "kitti"
+    min_height: MinHeight = "kitti"
 
     def __post_init__(self) -> None:
         if isinstance(self.classes, str) or not self.classes:
@@ -92,8 +96,9 @@ class EvaluationProtocol:
         self._check_limits()
 
     def _check_choices(self) -> None:
-        choices = (("recall", RecallPoints), ("flavor", Flavor), ("range_rule", RangeRule), ("range_axis", RangeAxis))
-        for name, allowed in choices:
+        choices = {"recall": RecallPoints, "flavor": Flavor, "range_rule": RangeRule, "range_axis": RangeAxis}
+        choices["min_height"] = MinHeight
+        for name, allowed in choices.items():
             if getattr(self, name) not in get_args(allowed):
                 expected = " or ".join(str(choice) for choice in get_args(allowed))
                 raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)!r}")
@@ -120,7 +125,10 @@ class EvaluationProtocol:
     @property
     def rule(self) -> DifficultyRule:
         """The rule that `difficulty` names."""
-        return difficulty_named(self.difficulty, self.flavor) if isinstance(self.difficulty, str) else self.difficulty
+        named = isinstance(self.difficulty, str)
+        rule = difficulty_named(str(self.difficulty), self.flavor) if named else self.difficulty
+        assert not isinstance(rule, str)
+        return rule if self.min_height == "kitti" else AnyHeight(rule)
 
     @property
     def targets(self) -> tuple[Target, ...]:

@@ -1,16 +1,17 @@
-"""`--stage import`: public weights as our safetensors, and result pickles of OpenPCDet as KITTI result files."""
+"""`--stage import`: public weights as our safetensors, result pickles of other projects as KITTI result files."""
 
 from __future__ import annotations
 
 import argparse
 import hashlib
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from detection.kitti_format import KittiObject
 from pipeline.base.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    from pipeline.verbs.results import ImportedResults
 
 # The published network whose features the segmentation network of `pipeline.semantics.pyramid` stands on.
 BACKBONE = "efficientnet_lite0"
@@ -26,14 +27,16 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     parser.epilog = EXAMPLES
-    parser.add_argument("path", type=Path, metavar="FILE", help="a checkpoint, or OpenPCDet's result.pkl")
+    parser.add_argument(
+        "path", type=Path, metavar="FILE", help="a checkpoint, or a result pickle of OpenPCDet or mmdetection3d"
+    )
     parser.add_argument(
         "--architecture",
         required=True,
         metavar="NAME",
         help="twise, twise_maxpool, msg_chn, msg_chn_wacv, sparse_to_dense; pointrcnn, epnet, openpcdet_pointrcnn, "
         "pointpillar, second, voxel_rcnn, pv_rcnn; efficientnet_lite0 (backbone to train a segmentation network on); "
-        "or 'results' for a result.pkl",
+        "or 'results' for a result pickle",
     )
     out = "NAME.safetensors, or the folder of result files"
     parser.add_argument("--out", type=Path, required=True, metavar="FILE|DIR", help=out)
@@ -45,8 +48,10 @@ def run(args: argparse.Namespace) -> int:
     if not args.path.is_file():
         raise UsageError(f"no such file: {args.path}")
     if args.architecture == "results":
-        count = import_results(args.path, args.out)
-        print(json.dumps({"out": str(args.out), "files": count}) if args.json else f"{args.out}: {count} result files")
+        imported = import_results(args.path, args.out)
+        count, notes = len(imported.frames), imported.notes
+        record = {"out": str(args.out), "files": count, "notes": list(notes)}
+        print(json.dumps(record) if args.json else "\n".join([f"{args.out}: {count} result files", *notes]))
         return 0
     if args.out.suffix != ".safetensors":
         raise UsageError(f"--out {args.out}: expected a name that ends in .safetensors")
@@ -110,46 +115,17 @@ def _import_detector(path: Path, architecture: str, out: Path) -> Path:
     return save_checkpoint(model, IMPORTED_PRESETS[architecture](model), out, facts)
 
 
-def import_results(path: Path, out: Path) -> int:
-    """OpenPCDet's result.pkl (a list of frames with KITTI annotations) as one result file per frame; returns how many.
+def import_results(path: Path, out: Path) -> ImportedResults:
+    """Result pickles of OpenPCDet and mmdetection3d as one KITTI result file per frame; gives what was written.
 
     The pickle is read by an unpickler that knows containers and arrays only. Frames without objects give empty files.
-    Raises DataError when an entry lacks a field.
+    Raises DataError when an entry lacks a field, comes twice or holds NaN; then nothing is written.
     """
-    from pipeline.base.paths import safe_id
     from pipeline.check.safe_pickle import load_infos
     from pipeline.data.kitti_object import write_objects
+    from pipeline.verbs.results import read_results
 
-    frames = load_infos(path)
-    if not isinstance(frames, list):
-        raise DataError(path, "a list of frames", type(frames).__name__)
-    for frame in frames:
-        try:
-            name, objects = safe_id(str(frame["frame_id"])), result_objects(frame)
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise DataError(path, "frame_id, name, bbox, dimensions, location, rotation_y, score", f"{error}") from None
+    imported = read_results(load_infos(path), path)
+    for name, objects in imported.frames.items():
         write_objects(out / f"{name}.txt", objects)
-    return len(frames)
-
-
-def result_objects(frame: Mapping[str, Any]) -> list[KittiObject]:
-    """The objects of one entry; its dimensions are l h w, KITTI's lines have h w l."""
-    found = []
-    for index, name in enumerate(frame["name"]):
-        l, h, w = (float(value) for value in frame["dimensions"][index])
-        x, y, z = (float(value) for value in frame["location"][index])
-        x1, y1, x2, y2 = (float(value) for value in frame["bbox"][index])
-        found.append(
-            KittiObject(
-                type=str(name),
-                truncated=-1,
-                occluded=-1,
-                alpha=float(frame["alpha"][index]),
-                bbox=(x1, y1, x2, y2),
-                size=(h, w, l),
-                location=(x, y, z),
-                ry=float(frame["rotation_y"][index]),
-                score=float(frame["score"][index]),
-            )
-        )
-    return found
+    return imported

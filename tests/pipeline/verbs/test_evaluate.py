@@ -166,6 +166,7 @@ PROTOCOL_OPTIONS = {
     "range_rule": (["--range-rule", "border"], "border"),
     "range_axis": (["--range-axis", "radius"], "radius"),
     "difficulty": (["--difficulty", "vkitti2:and"], "vkitti2:and"),
+    "min_height": (["--min-height", "none"], "none"),
 }
 
 
