@@ -22,9 +22,11 @@ Work = Callable[[Frame, FrameOutputs], None]
 FRAME_CODE = (
     "detection/boxes.py",
     "detection/kitti_format.py",
+    "detection/text.py",
     "detection/types.py",
     "detection/evaluation/difficulty.py",
     "detection/evaluation/objects.py",
+    "detection/evaluation/reading.py",
     "pipeline/stages",
     "pipeline/data",
     "pipeline/geometry",

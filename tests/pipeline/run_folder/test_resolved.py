@@ -17,7 +17,7 @@ from pipeline.pointcloud.sigma_filter import SigmaBand
 from pipeline.run_folder.config import Config, dump_config, load_config
 from pipeline.run_folder.preset import preset_with_changes, uses_raw_lidar
 from pipeline.run_folder.resolved import resolved_config, synth_settings
-from pipeline.stages.augment import AUGMENT
+from pipeline.stages.augment import AugmentStage
 from pipeline.training.settings import SETTINGS, with_training_settings
 
 FIELDS = {field.name for field in fields(AugmentSettings)}
@@ -57,7 +57,7 @@ def test_other_presets_change_nothing_for_a_run_that_has_its_numbers(
         == before
         == replace(PRESETS["L_D_F"], grid=GridSampling(0.15), columns=("gap",))
     )
-    assert AUGMENT.settings(load_config(path)) == AUGMENT.settings(config)
+    assert AugmentStage.of(load_config(path)).settings() == AugmentStage.of(config).settings()
     assert preset_with_changes(config_with().augment).sigma == SigmaBand(0.1, 0.9, 1.0)  # a new run takes the new ones
     monkeypatch.setattr(presets, "PRESETS", {})  # even when the preset has gone
     assert preset_with_changes(load_config(path).augment) == before
