@@ -21,6 +21,8 @@ KITTI_RIGS = {
     (370, 1226): (707.0912, 601.8873, 183.1104),  # 2011_09_30
     (376, 1241): (718.8560, 607.1928, 185.2157),  # 2011_10_03
 }
+# Resizing keeps the aspect ratio, rounded to whole pixels; KITTI's crop of 1216 x 352 changes it by 4 %.
+_SAME_ASPECT = 0.012
 # Keys that tell the other KITTI calibration files apart from the object benchmark's.
 _FAMILIES = {
     "odometry": frozenset({"Tr"}),
@@ -74,6 +76,9 @@ def _check_rig(calibration: Calibration, frame: str, where: str, size: tuple[int
                 f"focal length {f:.2f} of the {rig_size[1]} x {rig_size[0]} rig, expected {own_focal:.2f} for this size"
             )
             return [Finding("other_rigs_calibration", frame, where, message)]
+        if uncropped and abs(size[1] * rig_size[0] / (size[0] * rig_size[1]) - 1) < _SAME_ASPECT:
+            message = f"{size[1]} x {size[0]} pixels with the camera matrix of {rig_size[1]} x {rig_size[0]}"
+            return [Finding("resized_image", frame, where, message)]
         if size[0] < rig_size[0] and size[1] <= rig_size[1] and uncropped:
             message = f"cy {cy:.2f} belongs to the uncropped image, expected {cy - (rig_size[0] - size[0]):.2f}"
             return [Finding("wrong_crop", frame, where, message)]

@@ -18,6 +18,8 @@ _MILLIMETRE_MEDIAN = 300.0
 # Beyond this share of values that float16 holds exactly, the cloud went through float16 (measured: 0.0-0.3 % on KITTI).
 _FLOAT16_SHARE = 0.99
 _FEWEST = 100
+# No LiDAR of a car gives so few points.
+_NO_CLOUD = 20
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ def check_cloud(points: NDArray[np.floating], frame: str, where: str) -> list[Fi
         message = f"{int(bad.sum())} of {len(points)} points hold NaN or infinite values (first: {int(bad.argmax())})"
         return [Finding("non_finite_points", frame, where, message)]
     if len(points) < _FEWEST:
-        return []
+        return [Finding("truncated_cloud", frame, where, f"{len(points)} points")] if len(points) < _NO_CLOUD else []
     distance = np.linalg.norm(points[:, :3].astype(np.float64), axis=1)
     middle = float(np.median(distance))
     if middle > _MILLIMETRE_MEDIAN:
@@ -70,10 +72,9 @@ def check_cloud(points: NDArray[np.floating], frame: str, where: str) -> list[Fi
             f"{int(wild.sum())} of {len(points)} points lie beyond {MAX_COORDINATE:g} m (first: {int(wild.argmax())})"
         )
         return [Finding("non_finite_points", frame, where, message)]
-    nowhere = int((distance == 0).sum())
-    if nowhere > 0.1 * len(points):
-        message = f"{nowhere} of {len(points)} points are 0 0 0: the file was not written to its end"
-        return [Finding("truncated_cloud", frame, where, message)]
+    found = _zeros(distance == 0, frame, where)
+    if found:
+        return found
     order = _vertical_axis(points)
     if order != 2:
         message = f"the flat axis is {'xyz'[order]} (column {order + 1}), expected z (column 3)"
@@ -85,6 +86,19 @@ def check_cloud(points: NDArray[np.floating], frame: str, where: str) -> list[Fi
         message = f"1 % of the intensities exceed {float(np.percentile(points[:, 3], 99)):.4g}, expected 0..1"
         return [Finding("intensity_scale", frame, where, message)]
     return []
+
+
+def _zeros(zero: NDArray[np.bool_], frame: str, where: str) -> list[Finding]:
+    """Many points 0 0 0: the rest of a file that was not written to its end, or returns that did not come back."""
+    nowhere, count = int(zero.sum()), len(zero)
+    if nowhere <= 0.1 * count:
+        return []
+    tail = count if zero.all() else int(np.argmin(zero[::-1]))
+    if tail > 0.5 * nowhere:
+        message = f"the last {tail} of {count} points are 0 0 0: the file was not written to its end"
+        return [Finding("truncated_cloud", frame, where, message)]
+    message = f"{nowhere} of {count} points are 0 0 0, between the others"
+    return [Finding("zero_returns", frame, where, message)]
 
 
 def _vertical_axis(points: NDArray[np.floating]) -> int:

@@ -37,6 +37,7 @@ FAULTS: dict[str, Fault] = {
     "wrong_columns": _fault(0, "points", "write the columns and the dtype that the format's loader reads"),
     "label_result_mixup": _fault(0, "labels", "labels have 15 columns, results 16 (score last): swap the folders back"),
     "malformed_labels": _fault(0, "labels", "see the message"),
+    "resized_image": _fault(0, "image calibration labels", "scale the rows 1 and 2 of P2 with the image"),
     "old_info_format": _fault(0, "infos", "mmdetection3d 1.1 and later want {metainfo, data_list}: export again"),
     "split_overlap": _fault(0, "splits", "a frame belongs to train or to val, not to both"),
     # contents of one part
@@ -47,6 +48,7 @@ FAULTS: dict[str, Fault] = {
     "non_finite_points": _fault(1, "points", "drop points with NaN, infinite or absurd values"),
     "cloud_in_millimetres": _fault(1, "points", "divide coordinates by 1000"),
     "axis_order": _fault(1, "points", "KITTI clouds are x forward, y left, z up"),
+    "zero_returns": _fault(1, "points", "drop the points 0 0 0: pulses that did not come back"),
     "float16_loss": _fault(1, "points", "keep float32: float16 rounds by up to 3 cm beyond 64 m"),
     "intensity_scale": _fault(1, "points", "divide intensity by 255 (or by 100): KITTI stores 0..1"),
     "source_flag_swapped": _fault(1, "points", "VirConv wants 2 for measured rows (first) and 1 for virtual rows"),
@@ -56,6 +58,7 @@ FAULTS: dict[str, Fault] = {
     "degrees_not_radians": _fault(1, "labels", "multiply by pi / 180: angles are in radians"),
     "yaw_sign": _fault(1, "labels", "ry turns about the camera's y axis, which points down: negate it"),
     "label_unit": _fault(1, "labels", "sizes and locations are in metres"),
+    "labels_in_lidar_frame": _fault(1, "labels", "KITTI's locations are those of the rectified camera"),
     "unknown_class": _fault(1, "labels", "use KITTI's class names (Car, Van, Truck, Pedestrian, ...)"),
     "label_outside_image": _fault(1, "labels", "boxes belong to another image size or crop"),
     "far_plane_as_depth": _fault(1, "depth", "65535 is sky in Virtual KITTI 2: write 0 (no value) instead"),
@@ -68,6 +71,7 @@ FAULTS: dict[str, Fault] = {
     "wrong_crop": _fault(
         3, "depth image", "undo the crop: KITTI's is bottom-centre, top = H - 352, left = (W - 1216) / 2"
     ),
+    "shifted_cloud": _fault(3, "points labels", "the origin is the LiDAR, not the ground below it"),
     "depth_unit": _fault(3, "depth", "KITTI depth is metres x 256; NYU is millimetres, Virtual KITTI 2 centimetres"),
     "depth_is_range": _fault(3, "depth", "store z along the optical axis, not the distance to the camera"),
     "depth_disagrees_with_lidar": _fault(3, "depth points", "was the network's checkpoint loaded (random weights)?"),

@@ -44,6 +44,8 @@ _FEWEST_RETURNS = 5
 _CERTAIN_GAIN = 0.1
 # Share of a frame's near objects that must hold returns before another reading of the data is believed.
 _CERTAIN = 0.8
+# Labelled objects stand on the road; farther from it, the origin of the cloud is not where the calibration has it.
+_SHIFT = 0.8
 # Horizontal axes in the orders that occur: the vertical one is judged from the cloud alone.
 _TURNS = {
     "y x z": np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]]),
@@ -229,6 +231,9 @@ def _read_calibration(parts: _Parts, layout: str) -> None:
     if calibration is None:
         return
     found = check_calibration(calibration, frame.id, parts.where("calibration"), parts.size)
+    if not found and calibration.T_cam_velo[2, 0] < -0.5 and layout != "folder":
+        message = f"LiDAR 'forward' maps to camera z {calibration.T_cam_velo[2, 0]:.2f}, expected near 1"
+        found = [Finding("wrong_extrinsics", frame.id, parts.where("calibration"), message)]
     if not found and calibration.T_cam_velo[1, 2] > -0.5 and layout != "folder":
         message = f"LiDAR 'up' maps to camera y {calibration.T_cam_velo[1, 2]:.2f}, expected near -1"
         found = [Finding("wrong_extrinsics", frame.id, parts.where("calibration"), message)]
@@ -282,6 +287,11 @@ def _check_placement(parts: _Parts, open_frame: Callable[[str], Frame], place: P
     if not near or _held(near, parts.points, parts.calibration) > 0:
         return
     frame, where = parts.frame.id, parts.where("labels")
+    shift = _height_of_labels(near, parts.points, parts.calibration)
+    if abs(shift) > _SHIFT and _held(near, parts.points[:, :3] + [0, 0, shift], parts.calibration) > _CERTAIN:
+        message = f"labelled objects stand {shift:+.2f} m above the road and hold points only when the cloud is moved"
+        parts.findings.append(Finding("shifted_cloud", frame, parts.where("points"), message))
+        return
     for name, turn in _TURNS.items():
         if _held(near, (parts.points[:, :3] @ turn.T), parts.calibration) > _CERTAIN:
             message = f"labelled objects hold points only when the columns are read as {name}"
@@ -300,6 +310,16 @@ def _check_placement(parts: _Parts, open_frame: Callable[[str], Frame], place: P
 def _has_returns(item: KittiObject) -> bool:
     visible = item.occluded in (0, 1) and 0 <= item.truncated < 0.3
     return visible and item.type in ("Car", "Van", "Truck", "Pedestrian", "Cyclist") and 4 < item.location[2] < _NEAR
+
+
+def _height_of_labels(objects: list[KittiObject], points: NDArray[np.floating], calibration: Calibration) -> float:
+    """Metres by which the objects' bottoms lie above the road, the lowest points as near as they are."""
+    boxes = boxes_in_lidar(boxes_of(objects), calibration)
+    distance = np.hypot(points[:, 0], points[:, 1])
+    around = points[(distance > 4) & (distance < _NEAR), 2]
+    if len(around) == 0:
+        return 0.0
+    return float(np.median(boxes[:, 2] - boxes[:, 5] / 2) - np.percentile(around, 10))
 
 
 def _held(objects: list[KittiObject], points: NDArray[np.floating], calibration: Calibration) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from detection.boxes import observation_angle, project_to_image, wrap_angle
 from detection.kitti_format import KittiObject, boxes_of, parse_lines
@@ -62,7 +63,7 @@ def check_objects(
     size: tuple[int, int] | None,
 ) -> list[Finding]:
     """Faults of a frame's objects; calibration and image size (height, width) are used when given."""
-    cared = [o for o in objects if o.type != "DontCare"]
+    cared = [o for o in objects if o.type.lower() != "dontcare"]
     findings = []
     unknown = sorted({o.type for o in objects} - set(CLASSES))
     if unknown:
@@ -73,6 +74,9 @@ def check_objects(
     message = _unit(cared)
     if message:
         return [*findings, Finding("label_unit", frame, where, message)]
+    message = "" if calibration is None else _in_lidar_frame(cared, calibration)
+    if message:
+        return [*findings, Finding("labels_in_lidar_frame", frame, where, message)]
     message = _dimensions(cared)
     if message:
         return [*findings, Finding("swapped_dimensions", frame, where, message)]
@@ -85,13 +89,35 @@ def check_objects(
 
 def _degrees(objects: list[KittiObject]) -> str:
     limit = 2 * np.pi + 0.01
-    wrong = [o for o in objects if abs(o.ry) > limit or (abs(o.alpha) > limit and o.alpha != UNKNOWN_ALPHA)]
+    wrong = [o for o in objects if any(abs(angle) > limit and angle != UNKNOWN_ALPHA for angle in (o.ry, o.alpha))]
     return f"{wrong[0].type} with ry {wrong[0].ry:g}, alpha {wrong[0].alpha:g}" if wrong else ""
 
 
 def _unit(objects: list[KittiObject]) -> str:
     wrong = [o for o in objects if max(o.size) > 100 or (max(map(abs, o.location)) > 300 and o.location[0] != -1000)]
     return f"{wrong[0].type} of size {wrong[0].size} at {wrong[0].location}" if wrong else ""
+
+
+def _in_lidar_frame(objects: list[KittiObject], calibration: Calibration) -> str:
+    """A message when the locations fall into their rectangles only as points of the LiDAR frame."""
+    known = [o for o in objects if o.location[0] != -1000 and o.bbox[3] - o.bbox[1] > 1]
+    if not known:
+        return ""
+    given = np.array([o.location for o in known])
+    as_camera, as_lidar = (_inside(known, points, calibration) for points in (given, calibration.velo_to_cam(given)))
+    if as_camera.mean() > 0.2 or as_lidar.mean() < 0.6:
+        return ""
+    first = known[int(np.argmax(as_lidar))]
+    return f"{first.type} at {first.location} lies in its rectangle only when x is forward and z up"
+
+
+def _inside(objects: list[KittiObject], points: NDArray[np.float64], calibration: Calibration) -> NDArray[np.bool_]:
+    """(N,) whether points in the camera frame fall into the rectangles, a quarter of their size wider on each side."""
+    pixels, depth = calibration.cam_to_image(points)
+    boxes = np.array([o.bbox for o in objects])
+    margin = 0.25 * (boxes[:, 2:] - boxes[:, :2]) + _PIXEL_TOLERANCE
+    inside = (pixels > boxes[:, :2] - margin) & (pixels < boxes[:, 2:] + margin)
+    return np.asarray(inside.all(axis=1) & (depth > 0.5))
 
 
 def _dimensions(objects: list[KittiObject]) -> str:
