@@ -116,9 +116,11 @@ class _Parts:
 def source_path(frame: Frame, part: str) -> Path | None:
     """The file behind a part: the path that the reader bound to the part's loader, if it bound one."""
     loader = frame.loaders.get(part)
-    paths = [argument for argument in getattr(loader, "args", ()) if isinstance(argument, Path)]
-    # Readers of tables bind a folder: such a part has no file of its own.
-    paths = [path for path in paths if not path.is_dir()]
+    arguments = getattr(loader, "args", ())
+    # Readers of tables bind a folder, derived parts another loader: such a part has no file of its own.
+    if any(isinstance(argument, partial) for argument in arguments):
+        return None
+    paths = [argument for argument in arguments if isinstance(argument, Path) and not argument.is_dir()]
     return paths[-1] if paths else None
 
 

@@ -52,15 +52,12 @@ class Frame:
         return part in self.loaders
 
     def files(self, part: str) -> tuple[Path, ...]:
-        """The files `part` is read from: the paths among its loader's arguments (readers use functools.partial).
+        """The files `part` is read from: the paths among its loader's arguments (readers use functools.partial), and
+        among those of a loader that is an argument itself.
 
         Empty when the loader names none; the runner then recognises a changed part by its content.
         """
-        loader = self.loaders.get(part)
-        if not isinstance(loader, partial):
-            return ()
-        arguments = (*loader.args, *loader.keywords.values())
-        return tuple(argument for argument in arguments if isinstance(argument, Path))
+        return _paths(self.loaders.get(part))
 
     def sources(self, part: str) -> tuple[str, ...]:
         """The parts that `part` is read from: itself when it is stored, else those it is derived from."""
@@ -140,3 +137,13 @@ class Frame:
     def point_frame(self) -> PointFrame:
         """The raw cloud with its camera, as `detection` takes it."""
         return PointFrame(self.points, self.calibration.T_cam_velo, self.calibration.P2, self.image_size, self.id)
+
+
+def _paths(loader: object) -> tuple[Path, ...]:
+    """The paths among the arguments of a functools.partial."""
+    if not isinstance(loader, partial):
+        return ()
+    arguments = (*loader.args, *loader.keywords.values())
+    return tuple(
+        path for argument in arguments for path in ((argument,) if isinstance(argument, Path) else _paths(argument))
+    )

@@ -140,6 +140,7 @@ def open_frame(root: Path, frame_id: str) -> Frame:
     """One frame; nothing is read yet. Parts whose file is absent are not offered."""
     rgb = frame_path(root, frame_id, "rgb", "rgb", ".jpg")
     text = text_folder(root, frame_id)
+    intrinsic = text / "intrinsic.txt"
     loaders: dict[str, Callable[[], Any]] = {"image": partial(read_image, rgb), "image_size": partial(image_size, rgb)}
     files: dict[str, tuple[Callable[[Path], Any], Path]] = {
         "target_depth": (read_depth, frame_path(root, frame_id, "depth", "depth", ".png")),
@@ -150,25 +151,25 @@ def open_frame(root: Path, frame_id: str) -> Frame:
     for part, (reader, path) in files.items():
         if path.is_file():
             loaders[part] = partial(reader, path)
-    if (text / "intrinsic.txt").is_file():
-        loaders["calibration"] = partial(read_frame_calibration, root, frame_id)
+    if intrinsic.is_file():
+        loaders["calibration"] = partial(read_intrinsic, intrinsic, frame_id)
         if "target_depth" in loaders and "sparse_depth" not in loaders:
-            loaders["sparse_depth"] = partial(_sampled, root, frame_id, files["target_depth"][1])
+            loaders["sparse_depth"] = partial(_sampled, intrinsic, frame_id, files["target_depth"][1])
         if "sparse_depth" in loaders:
-            loaders["points"] = partial(_sampled_points, root, frame_id, loaders["sparse_depth"])
+            loaders["points"] = partial(_sampled_points, intrinsic, frame_id, loaders["sparse_depth"])
     if (text / "bbox.txt").is_file() and (text / "pose.txt").is_file():
         loaders["labels"] = partial(read_labels, root, frame_id)
     return Frame(frame_id, loaders, str(root))
 
 
-def _sampled(root: Path, frame_id: str, depth: Path) -> NDArray[np.float32]:
+def _sampled(intrinsic: Path, frame_id: str, depth: Path) -> NDArray[np.float32]:
     """(H, W) metres of a 64-row LiDAR-like subsampling of the dense depth (`lidar_like.sample_like_lidar`)."""
-    return sample_like_lidar(read_depth(depth), read_frame_calibration(root, frame_id))
+    return sample_like_lidar(read_depth(depth), read_intrinsic(intrinsic, frame_id))
 
 
-def _sampled_points(root: Path, frame_id: str, sparse: Callable[[], Any]) -> NDArray[np.float32]:
+def _sampled_points(intrinsic: Path, frame_id: str, sparse: Callable[[], Any]) -> NDArray[np.float32]:
     """(N, 4) the sparse depth as a cloud, intensity 0."""
-    return depth_points(sparse(), read_frame_calibration(root, frame_id))
+    return depth_points(sparse(), read_intrinsic(intrinsic, frame_id))
 
 
 def sampled_depth_path(root: Path, frame_id: str) -> Path:
@@ -226,10 +227,9 @@ def colors_to_train_ids(
     return np.where(known, values[index], 255).astype(np.uint8)
 
 
-def read_frame_calibration(root: Path, frame_id: str) -> Calibration:
+def read_intrinsic(path: Path, frame_id: str) -> Calibration:
     """Camera matrix of intrinsic.txt as a calibration without LiDAR; P3 is the right camera for frames of Camera_0."""
     frame, camera = frame_numbers(frame_id)
-    path = text_folder(root, frame_id) / "intrinsic.txt"
     row = read_camera_rows(path, 4).get((frame, camera))
     if row is None:
         raise DataError(path, f"a row for frame {frame} camera {camera}", "none")

@@ -79,6 +79,14 @@ def test_calibration_has_no_lidar_offset(tree: Path) -> None:
     np.testing.assert_allclose(calibration.velo_to_cam(np.array([[10.0, 2.0, 1.0]])), [[-2.0, -1.0, 10.0]])
 
 
+def test_parts_name_the_files_they_are_read_from(tree: Path) -> None:
+    frame = open_dataset("vkitti2", tree)[0]
+    names = {part: {path.name for path in frame.files(part)} for part in ("calibration", "sparse_depth", "points")}
+    depth = {"intrinsic.txt", "depth_00000.png"}
+    assert names == {"calibration": {"intrinsic.txt"}, "sparse_depth": depth, "points": depth}
+    assert all(path.is_file() for part in names for path in frame.files(part))
+
+
 def test_classes_become_train_ids(tree: Path) -> None:
     frame = open_dataset("vkitti2", tree)["Scene01/clone/Camera_0/00000"]
     assert frame.semantics[0, 0] == 10
