@@ -174,6 +174,8 @@ def run_batch(
 ) -> int:
     """The frame stages, then the scores and the report when they are asked for."""
     batch = open_batch(config, run, request.shard, stop, request.engine)
+    for note in batch.dataset.notes:
+        print(f"note: {note}", file=sys.stderr)
     try:
         stages = stages_to_run(stage, config, batch.dataset)
         summaries = [batch.run_stage(name) for name in stages if not stop()]

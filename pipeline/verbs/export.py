@@ -65,6 +65,8 @@ def run(args: argparse.Namespace) -> int:
     dataset = open_dataset(args.dataset, args.data, args.columns)
     if dataset.refusal:
         raise UsageError(dataset.refusal)
+    for note in dataset.notes:
+        print(f"note: {note}", file=sys.stderr)
     if args.frames:
         dataset = dataset.select(args.frames)
     elif args.run is not None:
