@@ -16,6 +16,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from pipeline.base.errors import DataError
+from pipeline.base.files import read_text
 
 Key = tuple[int, int]
 
@@ -138,12 +139,7 @@ def _rows(path: Path, columns: int) -> list[list[str]]:
 
 
 def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        raise DataError(path, "a Virtual KITTI 2 text file", "no such file") from None
-    except UnicodeDecodeError:
-        raise DataError(path, "a text file", "bytes that are not UTF-8") from None
+    return read_text(path, "a Virtual KITTI 2 text file").splitlines()
 
 
 def read_camera_rows(path: Path, columns: int) -> dict[Key, tuple[float, ...]]:

@@ -17,7 +17,6 @@ ONCE_MISTAKEN = (
     "class 'dontcare'",
     "locations in the LiDAR frame",
     "camera turned by 180 degrees",
-    "Tr_velo_to_cam of zeros",
 )
 
 
