@@ -26,7 +26,8 @@ from completion.train import TrainSettings as DepthSettings
 from completion.train import train as train_depth
 from completion.training_loss import LossSettings, default_kind, training_loss
 from detection.models import layers
-from detection.train import Trainer, TrainSettings, collate, prepare_sample, training_scene
+from detection.train import Trainer, TrainSettings
+from detection.training_batches import collate, prepare_sample, training_scene
 from detection.types import PointFrame
 from pipeline.data import Dataset, open_dataset
 from pipeline.training.stage import DepthSamples
@@ -58,7 +59,7 @@ def timed(run: Callable[[int], object], first: int, steps: int) -> float:
 def detection_measure(clouds: Clouds, steps: int, points: int) -> Measure:
     """The small detector: `Trainer.step` after its first epoch, and the obvious loop, in turns of one step."""
     settings = TrainSettings(options={"points": points}, steps=10_000)
-    trainer = Trainer(settings, clouds, "cpu")
+    trainer = Trainer(settings, clouds)
     model: Any = trainer.preset.build()
     optimiser = torch.optim.Adam(model.parameters(), lr=1e-3)
 
@@ -120,7 +121,7 @@ def _trained(
 ) -> float:
     """Seconds of a run of `train`."""
     settings = DepthSettings(
-        spec, loss_settings, augmentation, epochs=10_000, max_steps=steps, batch=2, accumulate=1, log_every=steps
+        spec, loss_settings, augmentation, epochs=10_000, max_steps=steps, batch_size=2, accumulate=1, log_every=steps
     )
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()

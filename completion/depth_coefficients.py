@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from auglidar_base.errors import SettingsError
+
 # Channels `guard`: one extra bin at either end (the published network's 82 for 80 bins of 1 m).
 LAYOUTS = ("guard", "compact")
 METHODS = ("linear", "gaussian")
@@ -37,9 +39,9 @@ class Bins:
 
     def __post_init__(self) -> None:
         if self.layout not in LAYOUTS:
-            raise ValueError(f"layout: expected one of {', '.join(LAYOUTS)}, got {self.layout!r}")
+            raise SettingsError(f"layout: expected one of {', '.join(LAYOUTS)}, got {self.layout!r}")
         if self.count < 3 or not self.size > 0:
-            raise ValueError(f"bins: expected at least 3 of positive size, got {self.count} of {self.size} m")
+            raise SettingsError(f"bins: expected at least 3 of positive size, got {self.count} of {self.size} m")
 
     @property
     def channels(self) -> int:

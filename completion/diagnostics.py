@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from auglidar_base.errors import SettingsError
 from completion.analysis import mixed_share
 from completion.infer import Completer
 from completion.types import CompletedDepth, DepthFrame, FloatMap
@@ -92,7 +93,7 @@ def diagnose(completer: Completer, frames: Iterable[DepthFrame]) -> dict[str, fl
         without = _scores(grey, target)
         rows.append(found | {f"grey_{name}": without[name] for name in ("mae_mm", "tmae_mm")})
     if not rows:
-        raise ValueError("no frame with a target to diagnose on")
+        raise SettingsError("no frame with a target to diagnose on")
     columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     return {
         name: float(values[np.isfinite(values)].mean()) if np.isfinite(values).any() else float("nan")

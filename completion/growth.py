@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from auglidar_base.errors import SettingsError
+
 
 def grow(narrow: nn.Module, wide: nn.Module) -> list[str]:
     """Copy `narrow` into the leading channels of `wide`; returns the names of the tensors that are larger there.
@@ -17,12 +19,12 @@ def grow(narrow: nn.Module, wide: nn.Module) -> list[str]:
     """
     known, wanted = narrow.state_dict(), wide.state_dict()
     if known.keys() != wanted.keys():
-        raise ValueError(f"warm start: the networks differ in {sorted(known.keys() ^ wanted.keys())[:5]}")
+        raise SettingsError(f"warm start: the networks differ in {sorted(known.keys() ^ wanted.keys())[:5]}")
     grown = []
     for name, value in wanted.items():
         old = known[name]
         if old.dim() != value.dim() or any(a > b for a, b in zip(old.shape, value.shape)):
-            raise ValueError(f"warm start: {name} is {tuple(old.shape)}, expected at most {tuple(value.shape)}")
+            raise SettingsError(f"warm start: {name} is {tuple(old.shape)}, expected at most {tuple(value.shape)}")
         if old.shape != value.shape:
             grown.append(name)
         _copy_leading(old, value)
@@ -43,7 +45,7 @@ def adopt(source: nn.Module, target: nn.Module) -> list[str]:
         else:
             own.append(name)
     if len(own) == len(wanted):
-        raise ValueError(f"warm start: nothing in common with the weights given, which have {sorted(known)[:3]} ...")
+        raise SettingsError(f"warm start: nothing in common with the weights given, which have {sorted(known)[:3]} ...")
     return own
 
 

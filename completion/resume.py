@@ -13,8 +13,9 @@ from torch import Tensor, nn
 
 from auglidar_base.atomic import write_bytes
 from auglidar_base.errors import CheckpointError
+from auglidar_base.versions import own_version, state_of_another_version
 
-FORMAT = "auglidar-completion-run-1"
+FORMAT = "auglidar-completion-run-2"
 
 
 def save_state(
@@ -29,8 +30,13 @@ def save_state(
                 tensors[f"optimiser/{index}/{name}"] = value.detach()
             else:
                 numbers.setdefault(str(index), {})[name] = value
-    tensors["random/torch"] = torch.get_rng_state()
-    header = {"format": FORMAT, "facts": facts, "optimiser_numbers": numbers, "scaler": scaler.state_dict()}
+    header = {
+        "format": FORMAT,
+        "version": own_version(),
+        "facts": facts,
+        "optimiser_numbers": numbers,
+        "scaler": scaler.state_dict(),
+    }
     stored = {name: value.cpu().contiguous() for name, value in tensors.items()}
     write_bytes(path, save_tensors(stored, {"run": json.dumps(header)}))
 
@@ -38,15 +44,18 @@ def save_state(
 def load_state(
     path: Path, model: nn.Module, optimiser: torch.optim.Optimizer, scaler: torch.amp.GradScaler
 ) -> dict[str, Any]:
-    """Restore model, optimiser, scaler and torch's generator in place; returns the facts.
+    """Restore model, optimiser and scaler in place; returns the facts.
 
-    CheckpointError when the file is not of this network.
+    CheckpointError when the file is not of this network, or of an earlier version.
     """
     with safe_open(path, "pt") as file:
         header = json.loads((file.metadata() or {}).get("run", "{}"))
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
-    if header.get("format") != FORMAT:
-        raise CheckpointError(f"{path}: expected the state of a training run ({FORMAT}), got {header.get('format')!r}")
+    found = str(header.get("format"))
+    if not found.startswith("auglidar-completion-run-"):
+        raise CheckpointError(f"{path}: expected the state of a training run ({FORMAT}), got {found}")
+    if found != FORMAT:
+        raise state_of_another_version(path, found, FORMAT, header.get("version"))
     try:
         model.load_state_dict(
             {name.removeprefix("model/"): t for name, t in tensors.items() if name.startswith("model/")}
@@ -60,6 +69,5 @@ def load_state(
             state.setdefault(int(index), {})[key] = tensor
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
     scaler.load_state_dict(header["scaler"])
-    torch.set_rng_state(tensors["random/torch"])
     facts: dict[str, Any] = header["facts"]
     return facts

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from auglidar_base.errors import SettingsError
 from completion.types import DepthFrame, FloatMap
 
 
@@ -67,13 +68,13 @@ class Batch(NamedTuple):
 
 
 def _corner(frame: DepthFrame, augmentation: Augmentation, rng: np.random.Generator) -> tuple[int, int, int, int]:
-    """(top, left, height, width) of a crop. ValueError when the frame is smaller."""
+    """(top, left, height, width) of a crop. SettingsError when the frame is smaller."""
     height, width = frame.size
     if augmentation.crop is None:
         return 0, 0, height, width
     h, w = augmentation.crop
     if h > height or w > width:
-        raise ValueError(f"crop {h}x{w} is larger than the frame {height}x{width}")
+        raise SettingsError(f"crop {h}x{w} is larger than the frame {height}x{width}")
 
     def draw() -> tuple[int, int, int, int]:
         top = height - h if augmentation.bottom else int(rng.integers(height - h + 1))
@@ -115,12 +116,12 @@ def disturb_image(image: NDArray[np.uint8], augmentation: Augmentation, rng: np.
 def draw_crop(
     sample: DepthFrame | TrainingSample, augmentation: Augmentation, rng: np.random.Generator
 ) -> tuple[FloatMap, NDArray[np.uint8], FloatMap]:
-    """Sparse (h, w), RGB (h, w, 3) and target (h, w) of one augmented crop. ValueError for a frame without target."""
+    """Sparse (h, w), RGB (h, w, 3) and target (h, w) of one augmented crop. SettingsError without a target."""
     if isinstance(sample, DepthFrame):
         sample = TrainingSample(sample)
     frame = sample.frame
     if frame.target is None:
-        raise ValueError("a training frame needs a target depth, this one has none")
+        raise SettingsError("a training frame needs a target depth, this one has none")
     sparse = frame.sparse if sample.draw_sparse is None else sample.draw_sparse(rng)
     if sparse.shape != frame.size:
         raise ValueError(f"draw_sparse: expected a map of {frame.size}, got {sparse.shape}")
@@ -155,9 +156,11 @@ class StepBatches:
         processes: int = 1,
     ) -> None:
         if len(source) == 0:
-            raise ValueError("no training samples")
+            raise SettingsError("no training samples")
         if (batch * accumulate) % crops_per_frame:
-            raise ValueError(f"crops_per_frame {crops_per_frame} must divide batch x accumulate = {batch * accumulate}")
+            raise SettingsError(
+                f"crops_per_frame {crops_per_frame} must divide batch_size x accumulate = {batch * accumulate}"
+            )
         self.source, self.augmentation, self.seed = source, augmentation, seed
         self.batch, self.accumulate, self.crops_per_frame = batch, accumulate, crops_per_frame
         self.rank, self.processes = rank, processes
@@ -187,7 +190,7 @@ class StepBatches:
     def _stack(crops: list[tuple[FloatMap, NDArray[np.uint8], FloatMap]]) -> Batch:
         sizes = {sparse.shape for sparse, _, _ in crops}
         if len(sizes) != 1:
-            raise ValueError(f"frames of a batch differ in size {sorted(sizes)}; set a crop or batch = 1")
+            raise SettingsError(f"frames of a batch differ in size {sorted(sizes)}; set a crop or batch_size = 1")
         return Batch(
             torch.from_numpy(np.stack([sparse for sparse, _, _ in crops]))[:, None],
             torch.from_numpy(np.stack([image for _, image, _ in crops])).permute(0, 3, 1, 2).contiguous(),

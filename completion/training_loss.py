@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from auglidar_base.errors import SettingsError
 from completion import losses
 from completion.depth_coefficients import Bins, cross_entropy
 from completion.mixture import expected_depth, negative_log_likelihood
@@ -29,10 +32,12 @@ class LossSettings:
     edge_weight      extra weight of pixels at depth edges of the target (0: none; 4: five times)
     relative_weight  share of a pixel's weight that falls with distance beyond 10 m (1: as 10 m / distance)
     above_top_ring   weight of pixels above the topmost measured ring, where nothing can be interpolated (0: no loss)
-    max_depth          metres; deeper targets are left out (beyond a LiDAR's range nothing can be learned, yet their
+    max_depth        metres; deeper targets are left out (beyond a LiDAR's range nothing can be learned, yet their
                      errors outweigh the rest); 0: none are, as published
     auxiliary        weight of further outputs of a "dc" network (published: 0.8)
     """
+
+    RENAMED: ClassVar[Mapping[str, str]] = {"deepest": "max_depth"}
 
     kind: str = "twin"
     gamma: float = 2.0
@@ -48,11 +53,11 @@ class LossSettings:
 
     def __post_init__(self) -> None:
         if self.kind not in LOSS_KINDS:
-            raise ValueError(f"loss: expected one of {', '.join(LOSS_KINDS)}, got {self.kind!r}")
+            raise SettingsError(f"loss: expected one of {', '.join(LOSS_KINDS)}, got {self.kind!r}")
         if self.gamma < 1:
-            raise ValueError(f"gamma: expected >= 1, got {self.gamma}")
+            raise SettingsError(f"gamma: expected >= 1, got {self.gamma}")
         if self.target_pooling not in losses.POOLING_RULES:
-            raise ValueError(
+            raise SettingsError(
                 f"target_pooling: expected one of {', '.join(losses.POOLING_RULES)}, got {self.target_pooling!r}"
             )
 
@@ -63,12 +68,12 @@ def default_kind(spec: ModelSpec) -> str:
 
 
 def fits(loss_settings: LossSettings, spec: ModelSpec) -> None:
-    """ValueError when a network with this output cannot be trained by this loss_settings."""
+    """SettingsError when a network with this output cannot be trained by this loss_settings."""
     needed = {"twin": "twin", "dc": "coefficients", "mixture": "mixture"}.get(loss_settings.kind, "depth")
     # A mixture has an expected depth, so that the same network can be trained by a loss on one depth.
     offered = (spec.output, "depth") if spec.output == "mixture" else (spec.output,)
     if needed not in offered:
-        raise ValueError(
+        raise SettingsError(
             f"loss {loss_settings.kind!r} needs a network with output {needed!r}, "
             f"{spec.architecture} gives {spec.output!r}"
         )

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from auglidar_base.atomic import write_bytes
+from auglidar_base.errors import CheckpointError
 from detection.models.presets import PRESETS, Preset
 
 WEIGHTS = Path(__file__).parent / "weights"
@@ -27,14 +28,14 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[st
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors and metadata of a safetensors file. Raises ValueError naming the file when it is not one."""
+    """Tensors and metadata of a safetensors file. Raises CheckpointError naming the file when it is not one."""
     from safetensors import SafetensorError, safe_open
 
     try:
         with safe_open(str(path), framework="pt") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
     except SafetensorError as error:
-        raise ValueError(f"{path}: expected a safetensors file ({error}); is it truncated?") from error
+        raise CheckpointError(f"{path}: expected a safetensors file ({error}); is it truncated?") from error
 
 
 def save_checkpoint(model: nn.Module, preset: Preset, path: str | Path, facts: Mapping[str, Any]) -> Path:
@@ -65,22 +66,22 @@ def find_weights(path_or_name: str | Path) -> Path:
     if bundled.is_file():
         return bundled
     names = ", ".join(sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))) or "none"
-    raise ValueError(
+    raise CheckpointError(
         f"{path_or_name}: expected a .safetensors file or the name of bundled weights (there are: {names})"
     )
 
 
 def read_card(weights: Path) -> dict[str, Any]:
-    """The card beside a weights file. Raises ValueError when it is missing or does not describe these weights."""
+    """The card beside a weights file. Raises CheckpointError when it is missing or does not describe these weights."""
     path = weights.with_suffix(".json")
     if not path.is_file():
-        raise ValueError(f"{weights}: expected its card {path.name} beside it; copy both files together")
+        raise CheckpointError(f"{weights}: expected its card {path.name} beside it; copy both files together")
     card = json.loads(path.read_text())
     if not isinstance(card, dict) or "preset" not in card:
-        raise ValueError(f"{path}: expected a JSON object with a 'preset', got something else")
+        raise CheckpointError(f"{path}: expected a JSON object with a 'preset', got something else")
     digest = hashlib.sha256(weights.read_bytes()).hexdigest()
     if card.get("sha256") != digest:
-        raise ValueError(
+        raise CheckpointError(
             f"{weights}: sha256 is {digest}, its card says {card.get('sha256')}; the file is damaged or mixed up"
         )
     return card
@@ -89,12 +90,12 @@ def read_card(weights: Path) -> dict[str, Any]:
 def preset_of(card: Mapping[str, Any], where: str | Path) -> Preset:
     """The preset a card names, with its options."""
     if card["preset"] not in PRESETS:
-        raise ValueError(f"{where}: unknown preset {card['preset']!r}; known are {', '.join(PRESETS)}")
+        raise CheckpointError(f"{where}: unknown preset {card['preset']!r}; known are {', '.join(PRESETS)}")
     return PRESETS[card["preset"]](**card.get("options", {}))
 
 
 def load_checkpoint(path_or_name: str | Path, device: str = "cpu") -> tuple[nn.Module, Preset, dict[str, Any]]:
-    """Model (in eval mode, on `device`), preset and card of our own weights. Raises ValueError saying what is wrong."""
+    """Model (in eval mode, on `device`), preset and card of our own weights. CheckpointError says what is wrong."""
     weights = find_weights(path_or_name)
     card = read_card(weights)
     preset = preset_of(card, weights)
@@ -104,7 +105,7 @@ def load_checkpoint(path_or_name: str | Path, device: str = "cpu") -> tuple[nn.M
 
 
 def load_exactly(model: nn.Module, tensors: Mapping[str, Tensor], where: str | Path) -> None:
-    """Load a state dict whose names and shapes must all match. Raises ValueError listing what does not."""
+    """Load a state dict whose names and shapes must all match. Raises CheckpointError listing what does not."""
     wanted = model.state_dict()
     missing = sorted(wanted.keys() - tensors.keys())
     unknown = sorted(tensors.keys() - wanted.keys())
@@ -115,7 +116,7 @@ def load_exactly(model: nn.Module, tensors: Mapping[str, Tensor], where: str | P
     ]
     if missing or unknown or misshaped:
         parts = [f"missing {missing[:5]}"] * bool(missing) + [f"unknown {unknown[:5]}"] * bool(unknown)
-        raise ValueError(f"{where}: weights do not fit the network: " + "; ".join([*parts, *misshaped[:5]]))
+        raise CheckpointError(f"{where}: weights do not fit the network: " + "; ".join([*parts, *misshaped[:5]]))
     model.load_state_dict(dict(tensors))
 
 

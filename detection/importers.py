@@ -13,6 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from auglidar_base.errors import CheckpointError
 from auglidar_base.torch_pickle import read_torch_pickle
 from detection.models.lidar_presets import OPENPCDET_PRESETS, openpcdet_features
 from detection.models.openpcdet_pointrcnn import OpenPCDetPointRCNN
@@ -30,7 +31,9 @@ def read_tensors(path: str | Path) -> dict[str, Tensor]:
         tensors = {str(k).removeprefix("module."): v for k, v in content.items() if isinstance(v, Tensor)}
         if tensors:
             return tensors
-    raise ValueError(f"{path}: expected a dictionary with 'model_state' or a state dict of tensors, found no tensor")
+    raise CheckpointError(
+        f"{path}: expected a dictionary with 'model_state' or a state dict of tensors, found no tensor"
+    )
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ class ImportReport:
 def fill(model: nn.Module, tensors: Mapping[str, Tensor], where: str | Path) -> ImportReport:
     """Load tensors by name; every parameter and running statistic must be there with its shape.
 
-    Shapes may differ by trailing axes of length 1 (Linear, Conv1d, Conv2d). Raises ValueError listing every name that
+    Shapes may differ by trailing axes of length 1 (Linear, Conv1d, Conv2d). CheckpointError lists every name that
     is missing, unknown or misshapen.
     """
     own = model.state_dict()
@@ -69,7 +72,9 @@ def fill(model: nn.Module, tensors: Mapping[str, Tensor], where: str | Path) -> 
     wrong += [f"unknown {name}" for name in unused]
     if wrong:
         more = f"; and {len(wrong) - 8} more" if len(wrong) > 8 else ""
-        raise ValueError(f"{where}: does not fit this network ({len(own)} tensors): " + "; ".join(wrong[:8]) + more)
+        raise CheckpointError(
+            f"{where}: does not fit this network ({len(own)} tensors): " + "; ".join(wrong[:8]) + more
+        )
     model.load_state_dict(loaded)
     return ImportReport(tuple(name for name in own if name in tensors), counters, unused)
 
@@ -86,7 +91,7 @@ def _extra_channels(tensors: Mapping[str, Tensor]) -> tuple[str, ...]:
     first = tensors.get("rpn.backbone_net.SA_modules.0.mlps.0.layer0.conv.weight")
     extra = 0 if first is None else int(first.shape[1]) - 3
     if extra not in (0, 1):
-        raise ValueError(f"expected 3 or 4 input channels (x y z, intensity), the checkpoint has {extra + 3}")
+        raise CheckpointError(f"expected 3 or 4 input channels (x y z, intensity), the checkpoint has {extra + 3}")
     return ("intensity",) * extra
 
 
@@ -100,7 +105,7 @@ def _pointrcnn(tensors: Mapping[str, Tensor]) -> nn.Module:
 def _epnet(tensors: Mapping[str, Tensor]) -> nn.Module:
     fused = sorted({name.split(".")[2] for name in tensors if re.search(r"\.(Img_Block|Fusion_Conv|DeConv)\.", name)})
     if fused:
-        raise ValueError(
+        raise CheckpointError(
             f"this EPNet checkpoint was trained with image fusion (it holds {', '.join(fused)}); its point layers "
             "expect fused features, so it cannot run on points alone; take the one trained without LI-Fusion"
         )
@@ -157,12 +162,12 @@ BUILDERS: dict[str, Callable[[Mapping[str, Tensor]], nn.Module]] = {
 def import_with_report(path: str | Path, architecture: str) -> tuple[nn.Module, ImportReport]:
     """`import_checkpoint`, and what became of every tensor."""
     if architecture not in BUILDERS:
-        raise ValueError(f"unknown architecture {architecture!r}; known are {', '.join(BUILDERS)}")
+        raise CheckpointError(f"unknown architecture {architecture!r}; known are {', '.join(BUILDERS)}")
     tensors = read_tensors(path)
     try:
         model = BUILDERS[architecture](tensors)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise CheckpointError(f"{path}: {error}") from error
     return model.eval(), fill(model, to_spconv2(tensors, model), path)
 
 
@@ -171,6 +176,6 @@ def import_checkpoint(path: str | Path, architecture: str) -> nn.Module:
 
     architecture  "pointrcnn" (52 or 76 first-stage channels, told apart by shape), "epnet" (fusion off),
                   "openpcdet_pointrcnn", and OpenPCDet's "pointpillar", "second", "voxel_rcnn", "pv_rcnn"
-    Raises ValueError when the file calls functions, is damaged, or does not fit; nothing in it is executed.
+    Raises CheckpointError when the file calls functions, is damaged, or does not fit; nothing in it is executed.
     """
     return import_with_report(path, architecture)[0]

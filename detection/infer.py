@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from auglidar_base.errors import CheckpointError
 from detection.boxes import wrap_angle
 from detection.checkpoints import import_checkpoint, load_checkpoint
 from detection.inputs import CameraCloud, camera_cloud, ground_height, lidar_input, mirrored, network_input
@@ -39,7 +40,7 @@ class Detector:
         """Objects of one frame, best score first, boxes in the rectified camera frame.
 
         Only points inside the image and the detection range count; without any, nothing is found.
-        Raises ValueError when the frame lacks a column the network was trained with.
+        Raises SettingsError when the frame lacks a column the network was trained with.
         """
         if self.preset.inputs.frame == "lidar":
             return self._detect_in_lidar_frame(frame)
@@ -88,7 +89,7 @@ class Detector:
 def load_detector(path_or_name: str | Path, device: str = "cpu", seed: int = 0) -> Detector:
     """A detector from our own weights: a .safetensors file with its card, or the name of bundled weights.
 
-    Raises ValueError saying what is wrong with the file, or which names there are.
+    Raises CheckpointError saying what is wrong with the file, or which names there are.
     """
     model, preset, _ = load_checkpoint(path_or_name, device)
     return Detector(model, preset, torch.device(device), seed)
@@ -97,11 +98,11 @@ def load_detector(path_or_name: str | Path, device: str = "cpu", seed: int = 0) 
 def imported_detector(path: str | Path, architecture: str, device: str = "cpu", seed: int = 0) -> Detector:
     """A detector from a public checkpoint; architectures as `detection.checkpoints.import_checkpoint`.
 
-    Raises ValueError when the file does not fit, or the architecture has no detector here.
+    Raises CheckpointError when the file does not fit, or the architecture has no detector here.
     """
     model = import_checkpoint(path, architecture)
     if architecture not in IMPORTED_PRESETS:
-        raise ValueError(f"no detector for {architecture!r}; there are {', '.join(IMPORTED_PRESETS)}")
+        raise CheckpointError(f"no detector for {architecture!r}; there are {', '.join(IMPORTED_PRESETS)}")
     preset = IMPORTED_PRESETS[architecture](model)
     return Detector(model.to(torch.device(device)), preset, torch.device(device), seed)
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from auglidar_base.errors import SettingsError
 from detection import sampling
 from detection.kitti_format import KittiObject
 from detection.types import PointFrame
@@ -95,10 +96,10 @@ def point_features(cloud: CameraCloud, height: NDArray[np.float32], names: Seque
 def _frame_column(cloud: CameraCloud, name: str) -> NDArray[np.float32]:
     position = {"intensity": 0, "source": 1, "semantic": 2}
     if name not in position:
-        raise ValueError(f"unknown point feature {name!r}; known are {', '.join(FEATURES)}")
+        raise SettingsError(f"unknown point feature {name!r}; known are {', '.join(FEATURES)}")
     have = cloud.columns.shape[1]
     if have <= position[name]:
-        raise ValueError(
+        raise SettingsError(
             f"feature '{name}': expected frames with at least {position[name] + 4} columns (x y z intensity source "
             f"semantic), got {have + 3}; detect on augmented clouds or choose a detector without this feature"
         )
@@ -165,7 +166,7 @@ def network_input(
     elif settings.sampler == "balanced":
         index = sampling.balanced_sample(cloud.xyz, height, settings.points, rng)
     else:
-        raise ValueError(f"unknown sampler {settings.sampler!r}; known are near_far, uniform, balanced")
+        raise SettingsError(f"unknown sampler {settings.sampler!r}; known are near_far, uniform, balanced")
     rows = np.concatenate([cloud.xyz, point_features(cloud, height, settings.features)], axis=1)
     full = rng.permutation(len(rows))[: settings.cloud]
     return rows[index], rows[full]

@@ -13,14 +13,13 @@ from torch import Tensor, nn
 class OneCycleSettings:
     """One-cycle schedule (Smith and Topin 2017) with cosine annealing.
 
-    peak     highest learning rate          division  start = peak / division; end = start / 10000
+    division start = peak / division; end = start / 10000, where peak is the learning rate of the settings
     rising   share of the steps with a rising rate
     momentum (high, low) of beta1, which runs against the rate
     decay    decoupled weight decay, times the learning rate, on every parameter (biases and normalisation too)
     clip     largest norm of the gradient
     """
 
-    peak: float = 0.002
     division: float = 10.0
     rising: float = 0.4
     momentum: tuple[float, float] = (0.95, 0.85)
@@ -32,30 +31,30 @@ def _anneal(start: float, end: float, share: float) -> float:
     return end + (start - end) / 2 * (1 + math.cos(math.pi * share))
 
 
-def one_cycle(step: int, steps: int, settings: OneCycleSettings) -> tuple[float, float]:
-    """(learning rate, beta1) of 0-based `step` of `steps`."""
-    low = settings.peak / settings.division
+def one_cycle(step: int, steps: int, peak: float, settings: OneCycleSettings) -> tuple[float, float]:
+    """(learning rate, beta1) of 0-based `step` of `steps`; peak is the highest learning rate."""
+    low = peak / settings.division
     turn = int(settings.rising * steps)
     high_momentum, low_momentum = settings.momentum
     if step < turn:
         share = step / turn
-        return _anneal(low, settings.peak, share), _anneal(high_momentum, low_momentum, share)
+        return _anneal(low, peak, share), _anneal(high_momentum, low_momentum, share)
     share = (step - turn) / max(steps - turn, 1)
-    return _anneal(settings.peak, low / 1e4, share), _anneal(low_momentum, high_momentum, share)
+    return _anneal(peak, low / 1e4, share), _anneal(low_momentum, high_momentum, share)
 
 
 class AdamOneCycle:
     """Adam (beta2 0.99) with decoupled weight decay before each step, driven by `one_cycle`."""
 
-    def __init__(self, model: nn.Module, steps: int, settings: OneCycleSettings) -> None:
-        self.settings, self.steps = settings, steps
+    def __init__(self, model: nn.Module, steps: int, peak: float, settings: OneCycleSettings) -> None:
+        self.settings, self.steps, self.peak = settings, steps, peak
         self.names = [name for name, parameter in model.named_parameters() if parameter.requires_grad]
         self.parameters: list[Tensor] = [parameter for parameter in model.parameters() if parameter.requires_grad]
-        self.adam = torch.optim.Adam(self.parameters, lr=settings.peak, betas=(settings.momentum[0], 0.99))
+        self.adam = torch.optim.Adam(self.parameters, lr=peak, betas=(settings.momentum[0], 0.99))
 
     def step(self, step: int) -> float:
         """Clip, decay and update with the gradients at hand; returns the norm of the gradient before clipping."""
-        rate, momentum = one_cycle(step, self.steps, self.settings)
+        rate, momentum = one_cycle(step, self.steps, self.peak, self.settings)
         norm = nn.utils.clip_grad_norm_(self.parameters, self.settings.clip)
         for group in self.adam.param_groups:
             group["lr"], group["betas"] = rate, (momentum, 0.99)

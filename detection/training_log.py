@@ -11,17 +11,18 @@ from auglidar_base.atomic import write_bytes
 
 
 class TrainingLog:
-    """log.csv of a run, and TensorBoard when it is installed."""
+    """A CSV file of a run, one row after so many steps, and TensorBoard when it is installed."""
 
-    def __init__(self, folder: Path, done: int) -> None:
-        self.path = folder / "log.csv"
+    def __init__(self, folder: Path, done: int, name: str = "log.csv") -> None:
+        self.path = folder / name
         rows = list(csv.reader(io.StringIO(self.path.read_text()))) if self.path.is_file() else []
         self.header = rows[0] if rows else []
         # Rows written after the last saved state are written again.
         kept = [row for row in rows if row and (row[0] == "step" or int(row[0]) <= done)]
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows(kept)
-        write_bytes(self.path, text.getvalue().encode())
+        if rows:
+            write_bytes(self.path, text.getvalue().encode())
         self.board = _tensorboard(folder)
 
     def write(self, step: int, values: dict[str, float]) -> None:

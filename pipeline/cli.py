@@ -7,10 +7,11 @@ import contextlib
 import difflib
 import signal
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-from pipeline.base.errors import DataError, UsageError
+from pipeline.base.errors import DataError, RenamedSettingWarning, UsageError
 from pipeline.runner.signals import Terminated, sigterm_as_interrupt
 from pipeline.verbs import available_verbs, verb_module
 from pipeline.verbs.parsers import STAGE_HELP, main_parser, verb_parser
@@ -20,7 +21,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The console script; returns the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
-        with sigterm_as_interrupt():
+        with sigterm_as_interrupt(), _renamed_settings_in_a_line():
             return _dispatch(arguments)
     except (UsageError, DataError) as error:
         print(f"run_pipeline: {error}", file=sys.stderr)
@@ -32,6 +33,24 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader of our output went away (`run_pipeline ... | head`).
         sys.stderr.close()
         return 1
+
+
+@contextlib.contextmanager
+def _renamed_settings_in_a_line() -> Iterator[None]:
+    """Each earlier name of a setting is told once, without the place in the program that found it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", RenamedSettingWarning)
+        show, told = warnings.showwarning, set[str]()
+
+        def in_a_line(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+            if not issubclass(category, RenamedSettingWarning):
+                show(message, category, *place, **more)
+            elif str(message) not in told:
+                told.add(str(message))
+                print(f"run_pipeline: {message}", file=sys.stderr)
+
+        warnings.showwarning = in_a_line
+        yield
 
 
 def _dispatch(arguments: list[str]) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 
 from torch import nn
 
+from auglidar_base.errors import SettingsError
 from completion.depth_coefficients import Bins
 from completion.models.coefficients import CoefficientNetwork, CoefficientSparseToDense
 from completion.models.hourglass import MultiStack, Twise
@@ -42,15 +43,15 @@ class ModelSpec:
 
     def __post_init__(self) -> None:
         if self.architecture not in MODELS:
-            raise ValueError(f"architecture: expected one of {', '.join(sorted(MODELS))}, got {self.architecture!r}")
+            raise SettingsError(f"architecture: expected one of {', '.join(sorted(MODELS))}, got {self.architecture!r}")
         if not isinstance(self.arguments, Mapping):
-            raise ValueError(f"arguments: expected names with values, got {self.arguments!r}")
+            raise SettingsError(f"arguments: expected names with values, got {self.arguments!r}")
         if self.rgb not in RGB_SCALINGS:
-            raise ValueError(f"rgb: expected one of {', '.join(RGB_SCALINGS)}, got {self.rgb!r}")
+            raise SettingsError(f"rgb: expected one of {', '.join(RGB_SCALINGS)}, got {self.rgb!r}")
         if self.output not in OUTPUTS:
-            raise ValueError(f"output: expected one of {', '.join(OUTPUTS)}, got {self.output!r}")
+            raise SettingsError(f"output: expected one of {', '.join(OUTPUTS)}, got {self.output!r}")
         if not self.depth_unit > 0:
-            raise ValueError(f"depth_unit: expected metres > 0, got {self.depth_unit}")
+            raise SettingsError(f"depth_unit: expected metres > 0, got {self.depth_unit}")
 
     @property
     def bins(self) -> Bins:
@@ -93,7 +94,7 @@ MODELS: dict[str, Entry] = {
 def default_spec(architecture: str, **arguments: Any) -> ModelSpec:
     """The published input scaling of `architecture` with these builder arguments. ValueError for an unknown name."""
     if architecture not in MODELS:
-        raise ValueError(f"architecture: expected one of {', '.join(sorted(MODELS))}, got {architecture!r}")
+        raise SettingsError(f"architecture: expected one of {', '.join(sorted(MODELS))}, got {architecture!r}")
     entry = MODELS[architecture]
     return ModelSpec(architecture, arguments, entry.depth_unit, entry.rgb, entry.output, entry.multiple_of)
 
@@ -108,4 +109,4 @@ def build_model(spec: ModelSpec) -> nn.Module:
     try:
         return MODELS[spec.architecture].builder(**spec.arguments)
     except TypeError as error:
-        raise ValueError(f"{spec.architecture}: cannot be built with {dict(spec.arguments)}: {error}") from error
+        raise SettingsError(f"{spec.architecture}: cannot be built with {dict(spec.arguments)}: {error}") from error

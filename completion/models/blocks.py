@@ -10,6 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from auglidar_base.errors import SettingsError
+
 
 def upsample2(x: Tensor) -> Tensor:
     """(B, C, h, w) -> (B, C, 2h, 2w), bilinear with aligned corners."""
@@ -131,14 +133,14 @@ def initialise(module: nn.Module, rule: str) -> None:
 
 
 def require_multiple(depth: Tensor, rgb: Tensor, multiple: int) -> None:
-    """ValueError unless (B, 1, H, W) and (B, 3, H, W) agree and H, W are multiples of `multiple`."""
+    """ValueError unless (B, 1, H, W) and (B, 3, H, W) agree; SettingsError unless H, W are multiples of `multiple`."""
     height, width = int(depth.shape[-2]), int(depth.shape[-1])
     if depth.ndim != 4 or rgb.ndim != 4 or depth.shape[1] != 1 or rgb.shape[1] != 3 or rgb.shape[2:] != depth.shape[2:]:
         raise ValueError(
             f"expected sparse (B, 1, H, W) and colour (B, 3, H, W), got {tuple(depth.shape)} and {tuple(rgb.shape)}"
         )
     if not torch.jit.is_tracing() and (height % multiple or width % multiple):
-        raise ValueError(
+        raise SettingsError(
             f"image size {height}x{width}: height and width must be multiples of {multiple}; "
             "completion.infer pads any image, or crop to e.g. 352x1216"
         )

@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from auglidar_base.errors import SettingsError
 from detection.evaluation.objects import Array, Mask
 
 LEVELS = ("easy", "moderate", "hard")
@@ -78,7 +79,7 @@ class Vkitti2Difficulty:
         choices = {"medium": ("or", "and"), "nesting": ("cumulative", "bands"), "leftover": ("next", "ignore")}
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
-                raise ValueError(f"{name}: expected {' or '.join(allowed)}, got {getattr(self, name)!r}")
+                raise SettingsError(f"{name}: expected {' or '.join(allowed)}, got {getattr(self, name)!r}")
 
     @property
     def min_height(self) -> tuple[float, float, float]:
@@ -140,7 +141,7 @@ def occlusion_from_fill(occupancy_ratio: Array, full_fill: float) -> Array:
     fully visible car, so 1 - occupancy_ratio would call nearly every car occluded.
     """
     if not 0 < full_fill <= 1:
-        raise ValueError(f"full_fill: expected a fraction in (0, 1], got {full_fill}")
+        raise SettingsError(f"full_fill: expected a fraction in (0, 1], got {full_fill}")
     return np.clip(1 - np.asarray(occupancy_ratio, dtype=np.float64) / full_fill, 0, 1)
 
 
@@ -155,5 +156,5 @@ def difficulty_named(name: str, flavor: str) -> DifficultyRule:
     fields = {"or": "medium", "and": "medium", "cumulative": "nesting", "bands": "nesting"}
     fields |= {"next": "leftover", "ignore": "leftover"}
     if base != "vkitti2" or not set(options) <= set(fields):
-        raise ValueError(f"difficulty: expected kitti or vkitti2[:{'|'.join(fields)}]..., got {name!r}")
+        raise SettingsError(f"difficulty: expected kitti or vkitti2[:{'|'.join(fields)}]..., got {name!r}")
     return Vkitti2Difficulty(**{fields[option]: option for option in options})

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
+from auglidar_base.errors import SettingsError
 from detection.evaluation.difficulty import AnyHeight, DifficultyRule, difficulty_named
 
 Metric = Literal["2d", "aos", "bev", "3d"]
@@ -86,7 +87,7 @@ class EvaluationProtocol:
 
     def __post_init__(self) -> None:
         if isinstance(self.classes, str) or not self.classes:
-            raise ValueError(f"classes: expected a list of class names, got {self.classes!r}")
+            raise SettingsError(f"classes: expected a list of class names, got {self.classes!r}")
         ranges = tuple((low, high) for low, high in self.ranges)
         ious = {name: tuple(float(value) for value in values) for name, values in self.ious.items()}
         plain = {"classes": tuple(self.classes), "metrics": tuple(self.metrics), "ranges": ranges, "ious": ious}
@@ -101,26 +102,26 @@ class EvaluationProtocol:
         for name, allowed in choices.items():
             if getattr(self, name) not in get_args(allowed):
                 expected = " or ".join(str(choice) for choice in get_args(allowed))
-                raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)!r}")
+                raise SettingsError(f"{name}: expected {expected}, got {getattr(self, name)!r}")
         if self.iou_set not in get_args(IouSet):
-            raise ValueError(f"IoU set: expected one of {', '.join(get_args(IouSet))}, got {self.iou_set!r}")
+            raise SettingsError(f"IoU set: expected one of {', '.join(get_args(IouSet))}, got {self.iou_set!r}")
         wrong = [metric for metric in self.metrics if metric not in METRICS]
         if wrong or not self.metrics:
-            raise ValueError(f"metric: expected some of {', '.join(METRICS)}, got {wrong[0] if wrong else 'none'!r}")
+            raise SettingsError(f"metric: expected some of {', '.join(METRICS)}, got {wrong[0] if wrong else 'none'!r}")
         _ = self.rule  # a misspelt one is refused here
 
     def _check_limits(self) -> None:
         if any(name.lower() == "dontcare" for name in self.classes):
-            raise ValueError("classes: DontCare marks areas and cannot be evaluated")
+            raise SettingsError("classes: DontCare marks areas and cannot be evaluated")
         for name, values in self.ious.items():
             if name.lower() not in {cls.lower() for cls in self.classes}:
-                raise ValueError(f"IoU of {name}: that class is not evaluated ({', '.join(self.classes)} are)")
+                raise SettingsError(f"IoU of {name}: that class is not evaluated ({', '.join(self.classes)} are)")
             for value in values:
                 if not 0 <= value < 1:
-                    raise ValueError(f"IoU of {name}: expected 0 <= IoU < 1 (a match needs more than it), got {value}")
+                    raise SettingsError(f"IoU of {name}: expected 0 <= IoU < 1 (a match needs more), got {value}")
         for low, high in self.ranges:
             if high is not None and not low < high:
-                raise ValueError(f"range: expected LO < HI in metres, got {low} {high}")
+                raise SettingsError(f"range: expected LO < HI in metres, got {low} {high}")
 
     @property
     def rule(self) -> DifficultyRule:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
+from auglidar_base.errors import SettingsError
 from detection.inputs import SIMILAR
 from detection.models.compact import CompactPointRCNN
 
@@ -16,7 +17,7 @@ def with_classes(source: nn.Module, classes: Sequence[str]) -> nn.Module:
     """`source` for these classes: a class it lacks starts as a copy of the one it counts as (`SIMILAR`: Van as Car).
 
     Networks other than the compact one, and those that have just these classes, are returned as they are.
-    Raises ValueError for a class that neither the network nor its similar class knows.
+    Raises SettingsError for a class that neither the network nor its similar class knows.
     """
     if not isinstance(source, CompactPointRCNN) or source.settings.classes == tuple(classes):
         return source
@@ -24,7 +25,7 @@ def with_classes(source: nn.Module, classes: Sequence[str]) -> nn.Module:
     origin = [name if name in known else SIMILAR.get(name, name) for name in classes]
     unknown = [name for name in origin if name not in known]
     if unknown:
-        raise ValueError(f"warm start: the weights know {', '.join(known)}, nothing to start {unknown[0]} from")
+        raise SettingsError(f"warm start: the weights know {', '.join(known)}, nothing to start {unknown[0]} from")
     index = torch.tensor([known.index(name) for name in origin])
     target = CompactPointRCNN(replace(source.settings, classes=tuple(classes)))
     state = source.state_dict()

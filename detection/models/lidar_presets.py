@@ -9,6 +9,7 @@ from typing import Any
 
 from torch import nn
 
+from auglidar_base.errors import SettingsError
 from detection.inputs import InputSettings
 from detection.models.anchor_head import KITTI_ANCHORS, AnchorClass
 from detection.models.bev_backbone import BevSettings
@@ -50,7 +51,7 @@ def _anchor_classes(names: Sequence[str]) -> tuple[AnchorClass, ...]:
     known = {kind.name: kind for kind in KITTI_ANCHORS}
     unknown = [name for name in names if name not in known]
     if unknown or not names:
-        raise ValueError(f"classes: expected some of {', '.join(known)}, got {', '.join(names) or 'none'}")
+        raise SettingsError(f"classes: expected some of {', '.join(known)}, got {', '.join(names) or 'none'}")
     return tuple(known[name] for name in names)
 
 
@@ -192,7 +193,7 @@ def openpcdet_features(point_channels: int) -> tuple[str, ...]:
     """Point columns of an imported network: x y z intensity, then the columns of an augmented cloud in their order."""
     names = ("intensity", "source", "semantic")
     if not 3 <= point_channels <= 3 + len(names):
-        raise ValueError(
+        raise SettingsError(
             f"expected 3 to {3 + len(names)} point channels (x y z {' '.join(names)}), "
             f"the checkpoint has {point_channels}"
         )

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import nn
 
+from auglidar_base.errors import SettingsError
+
 # Input columns that stand behind the extra ones: a pillar's offsets to its mean and to its centre.
 _BEHIND = {"vfe.pfn_layers.0.linear.weight": 6}
 
@@ -16,7 +18,7 @@ def copy_matching(source: nn.Module, target: nn.Module) -> list[str]:
     Extra point channels are the last columns of the first set abstraction (x y z, extra) and of the last feature
     propagation (interpolated, skip); voxel encoders have them behind the point's others.
     Returns the names that were widened.
-    Raises ValueError when names differ or a shape differs in another way.
+    Raises SettingsError when names differ or a shape differs in another way.
     """
     old, new = source.state_dict(), target.state_dict()
     modules = {name.partition(".")[0] for name in old}
@@ -24,7 +26,7 @@ def copy_matching(source: nn.Module, target: nn.Module) -> list[str]:
         name for name in new.keys() - old.keys() if name.partition(".")[0] in modules
     }
     if differing:
-        raise ValueError(f"warm start: the networks differ in {sorted(differing)[:5]}")
+        raise SettingsError(f"warm start: the networks differ in {sorted(differing)[:5]}")
     widened = []
     for name, known in old.items():
         value = new[name]
@@ -33,7 +35,7 @@ def copy_matching(source: nn.Module, target: nn.Module) -> list[str]:
             continue
         axis = _widened_axis(known.shape, value.shape)
         if axis is None:
-            raise ValueError(
+            raise SettingsError(
                 f"warm start: {name} is {tuple(known.shape)}, expected {tuple(value.shape)} or fewer columns"
             )
         behind = _BEHIND.get(name, 0)

@@ -21,5 +21,9 @@ class MissingPart(DataError):
     """A frame has no such part (no label, no image, ...): a fact about the data set rather than damage."""
 
 
+class RenamedSettingWarning(FutureWarning):
+    """A setting was given by a name it had in an earlier version; the name is still understood."""
+
+
 class UsageError(Exception):
     """The request cannot be carried out (exit code 2): a wrong option, setting, folder or combination of them."""

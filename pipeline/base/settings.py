@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import typing
+import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
-from pipeline.base.errors import UsageError
+from auglidar_base.errors import SettingsError
+from pipeline.base.errors import RenamedSettingWarning, UsageError
 
 T = TypeVar("T")
 
@@ -25,9 +27,12 @@ def with_changes(base: T, changes: Mapping[str, Any], where: str, others: Iterab
 
     where   dotted name of the section, put in front of messages ("augment")
     others  names that the section knows beside these fields, for the suggestion in a message
-    A field that holds a dataclass takes a mapping of its own fields; a field that may be None takes null.
-    Raises UsageError for an unknown field (with the nearest known one) or a value that does not fit.
+    A field that holds a dataclass takes a mapping of its own fields; a field that may be None takes null. Names of
+    earlier versions, in the dataclass' RENAMED, are understood (see `renamed`).
+    Raises UsageError for an unknown field (with the nearest known one), a value that does not fit, or a SettingsError
+    of the dataclass; any other error in it is a fault of the program and goes through.
     """
+    changes = renamed(changes, getattr(base, "RENAMED", {}), where)
     hints = typing.get_type_hints(type(base))
     fields = [field.name for field in dataclasses.fields(base) if field.init]  # type: ignore[arg-type]
     new: dict[str, Any] = {}
@@ -37,8 +42,31 @@ def with_changes(base: T, changes: Mapping[str, Any], where: str, others: Iterab
         new[key] = _fitting(hints[key], getattr(base, key), value, f"{where}.{key}")
     try:
         return dataclasses.replace(base, **new)  # type: ignore[type-var]
-    except (TypeError, ValueError) as error:
+    except SettingsError as error:
         raise UsageError(f"{where}: {error}") from None
+
+
+def renamed(changes: Mapping[str, Any], names: Mapping[str, str], where: str) -> dict[str, Any]:
+    """`changes` with the names of today in place of those of earlier versions, with a warning for each of these.
+
+    names  name of earlier -> name of today; "section.name" is a key of a mapping that has moved out of it
+    Raises UsageError when a setting is given by both names.
+    """
+    found = dict(changes)
+    for old, new in names.items():
+        section, _, key = old.rpartition(".")
+        inside = found.get(section) if section else found
+        if not isinstance(inside, Mapping) or key not in inside:
+            continue
+        if new in found:
+            raise UsageError(f"{where}.{old} is the earlier name of {where}.{new}: give one of them")
+        text = f"{where}.{old} is called {where}.{new} now; the earlier name works until version 1.0"
+        warnings.warn(text, RenamedSettingWarning, stacklevel=3)
+        value = inside[key]
+        rest = {name: other for name, other in inside.items() if name != key}
+        found = {**found, section: rest} if section else rest
+        found[new] = value
+    return found
 
 
 def _fitting(hint: Any, current: Any, value: Any, where: str) -> Any:

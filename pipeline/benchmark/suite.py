@@ -16,6 +16,7 @@ from detection.infer import load_detector
 from detection.kitti_format import KittiObject
 from detection.results import result_objects
 from detection.types import PointFrame
+from pipeline.base.errors import UsageError
 from pipeline.benchmark.car_recall import CarReport, car_recall
 from pipeline.benchmark.held_out_rings import BEAM_STRIDES, hold_out, score
 from pipeline.data import Dataset, Frame
@@ -134,8 +135,8 @@ def _plain(report: CarReport) -> dict[str, Any]:
 
 
 def row_numbers(text: str) -> list[int]:
-    """'32,16,8' -> [32, 16, 8]. ValueError for other numbers of rows."""
+    """'32,16,8' -> [32, 16, 8]. UsageError for other numbers of rows."""
     numbers = [int(part) for part in text.split(",") if part.strip().isdigit()]
     if not numbers or any(number not in BEAM_STRIDES for number in numbers):
-        raise ValueError(f"rows: expected some of {', '.join(map(str, BEAM_STRIDES))}, got {text!r}")
+        raise UsageError(f"rows: expected some of {', '.join(map(str, BEAM_STRIDES))}, got {text!r}")
     return numbers

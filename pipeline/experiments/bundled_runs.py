@@ -109,7 +109,7 @@ def train_settings(recipe: Recipe, budget: BundledBudget, seed: int) -> TrainSet
         seed=seed,
         epochs=1,
         steps_per_epoch=steps,
-        batch=budget.batch,
+        batch_size=budget.batch,
         accumulate=1,
         crops_per_frame=2,
         learning_rate=budget.learning_rate * (0.6 if start else 1),
@@ -121,7 +121,7 @@ def train_settings(recipe: Recipe, budget: BundledBudget, seed: int) -> TrainSet
         # A squared loss teaches the mean of the mixture, so that is what it is read by.
         decoding="expected" if recipe.settings["loss"] == "l2" else "median",
         log_every=max(1, steps // 20),
-        checkpoint_steps=max(1, steps // 8),
+        save_every=max(1, steps // 8),
     )
 
 

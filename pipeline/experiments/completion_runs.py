@@ -113,7 +113,7 @@ def train_settings(recipe: Recipe, budget: CompletionBudget, seed: int) -> Train
         seed=seed,
         epochs=1,
         steps_per_epoch=budget.steps,
-        batch=budget.batch,
+        batch_size=budget.batch,
         accumulate=1,
         learning_rate=budget.learning_rate,
         schedule=budget.schedule,
@@ -121,8 +121,8 @@ def train_settings(recipe: Recipe, budget: CompletionBudget, seed: int) -> Train
         warmup_steps=min(20, budget.steps // 10),
         scale_weights=((0, (1, 1, 1)), (1 / 3, (1, 0.1, 0.1)), (2 / 3, (1, 0, 0))),
         log_every=max(1, budget.steps // 10),
-        checkpoint_steps=max(1, budget.steps // 4),
-        checkpoint_seconds=60.0,
+        save_every=max(1, budget.steps // 4),
+        save_seconds=60.0,
     )
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from detection.evaluation.bootstrap import Resampling
 from pipeline.base.errors import UsageError
 from pipeline.base.paths import RunFolder
+from pipeline.base.progress import duration
 from pipeline.base.settings import nearest_name, plain, with_changes
 from pipeline.experiments import detection_scores as scores
 from pipeline.experiments.cloud_cache import CloudCache, DepthCache, short_hash
@@ -122,7 +123,6 @@ def run(recipe: Recipe, context: Context) -> Outcome:
 def train_settings(recipe: DetectionRecipe, context: Context) -> TrainSettings:
     """What `detection.train` is told: the same steps for every row of a table."""
     from detection.data_augmentation import SceneAugmentation
-    from detection.optimiser import OneCycleSettings
     from detection.train import TrainSettings
 
     budget: DetectionBudget = context.budget
@@ -138,7 +138,7 @@ def train_settings(recipe: DetectionRecipe, context: Context) -> TrainSettings:
         steps=budget.steps,
         batch_size=budget.batch,
         seed=context.seed,
-        optimiser=OneCycleSettings(peak=budget.peak),
+        learning_rate=budget.peak,
         scene=scene,
         save_every=every,
         log_every=every,
@@ -167,16 +167,17 @@ def _trained(
     settings: TrainSettings, samples: LabelledFrames, clouds: list[str], start: Path | None, context: Context
 ) -> Path:
     """Weights in OUT/data/trained-HASH, trained from `start` (or nothing) or from the last saved state."""
+    from detection.checkpoints import read_card
     from detection.train import train
 
     record = [plain(settings), clouds, len(samples), "" if start is None else start.parent.name]
-    weights = context.out / "data" / f"trained-{short_hash(record)}" / "model.safetensors"
-    if weights.is_file():
+    weights = context.out / "data" / f"trained-{short_hash(record)}" / "last.safetensors"
+    if weights.is_file() and read_card(weights)["steps"] == settings.steps:
         return weights
 
     def report(progress: TrainProgress) -> None:
         text = f"step {progress.step} of {progress.steps}, loss {progress.losses['loss']:.2f}"
-        context.say(f"  {text}, {progress.seconds_per_step:.2f} s per step")
+        context.say(f"  {text}, about {duration(progress.eta)} left")
 
     begun = settings if start is None else replace(settings, warm_start=str(start))
     return train(begun, samples, weights.parent, progress=report)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from auglidar_base.errors import SettingsError
 from pipeline.base.errors import UsageError
 from pipeline.base.seeds import derive_seed
 from pipeline.base.settings import nearest_name, plain, with_changes
@@ -49,13 +50,13 @@ class InputRecipe:
 
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:
-            raise ValueError(f"preset: {nearest_name(self.preset, PRESETS)}, got {self.preset!r}")
+            raise SettingsError(f"preset: {nearest_name(self.preset, PRESETS)}, got {self.preset!r}")
         if self.depth not in DEPTHS:
-            raise ValueError(f"depth: expected one of {', '.join(DEPTHS)}, got {self.depth!r}")
+            raise SettingsError(f"depth: expected one of {', '.join(DEPTHS)}, got {self.depth!r}")
         if self.masks not in ("objects", "boxes"):
-            raise ValueError(f"masks: expected 'objects' or 'boxes', got {self.masks!r}")
+            raise SettingsError(f"masks: expected 'objects' or 'boxes', got {self.masks!r}")
         if self.rows < 1 or FULL_ROWS % self.rows:
-            raise ValueError(f"rows: expected a divisor of {FULL_ROWS}, got {self.rows}")
+            raise SettingsError(f"rows: expected a divisor of {FULL_ROWS}, got {self.rows}")
 
     @property
     def settings(self) -> AugmentSettings:

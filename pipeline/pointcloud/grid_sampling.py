@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from auglidar_base.errors import SettingsError
 from pipeline.geometry.clouds import DenseCloud
 from pipeline.pointcloud.cells import Cells, occupied_cells
 
@@ -28,9 +29,9 @@ class GridSampling:
 
     def __post_init__(self) -> None:
         if not 0 < self.size < np.inf:
-            raise ValueError(f"grid sampling: expected a cell size > 0 m, got {self.size:g}")
+            raise SettingsError(f"grid sampling: expected a cell size > 0 m, got {self.size:g}")
         if self.representative not in ("nearest", "first", "centroid"):
-            raise ValueError(f"grid sampling: expected nearest, first or centroid, got {self.representative!r}")
+            raise SettingsError(f"grid sampling: expected nearest, first or centroid, got {self.representative!r}")
 
 
 def grid_sample(points: NDArray[np.float32], grid: GridSampling) -> NDArray[np.int64]:

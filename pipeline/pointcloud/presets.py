@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
+from auglidar_base.errors import SettingsError
 from pipeline.pointcloud.grid_sampling import GridSampling
 from pipeline.pointcloud.radius_gather import Radii
 from pipeline.pointcloud.range_image import RangeGrid
@@ -54,15 +55,15 @@ class AugmentSettings:
         object.__setattr__(self, "columns", tuple(self.columns))
         unknown = [name for name in self.columns if name not in COLUMNS]
         if unknown or len(set(self.columns)) != len(self.columns):
-            raise ValueError(f"augment columns: expected different names of {', '.join(COLUMNS)}, got {self.columns}")
+            raise SettingsError(f"augment columns: expected different ones of {', '.join(COLUMNS)}, got {self.columns}")
         if not all(0 <= label <= 255 for label in self.classes):
-            raise ValueError(f"augment classes: expected Cityscapes trainIds 0-255, got {self.classes}")
+            raise SettingsError(f"augment classes: expected Cityscapes trainIds 0-255, got {self.classes}")
         if self.max_points < 0:
-            raise ValueError(f"augment max_points: expected 0 (no limit) or more, got {self.max_points}")
+            raise SettingsError(f"augment max_points: expected 0 (no limit) or more, got {self.max_points}")
         if self.semantic_lidar and self.semantic is None:
-            raise ValueError("augment semantic_lidar: needs a semantic mask")
+            raise SettingsError("augment semantic_lidar: needs a semantic mask")
         if not (self.lidar or self.completed):
-            raise ValueError("augment: neither raw LiDAR nor completed depth is asked for")
+            raise SettingsError("augment: neither raw LiDAR nor completed depth is asked for")
 
     @property
     def needs_semantics(self) -> bool:

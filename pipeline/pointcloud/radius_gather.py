@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from auglidar_base.errors import SettingsError
 from pipeline.pointcloud.cells import mark_near
 
 
@@ -28,7 +29,7 @@ class Radii:
 
     def __post_init__(self) -> None:
         if not (0 < self.near < np.inf and 0 < self.far < np.inf and self.split >= 0):
-            raise ValueError(f"radius gathering: expected radii > 0 m and split >= 0 m, got {self}")
+            raise SettingsError(f"radius gathering: expected radii > 0 m and split >= 0 m, got {self}")
 
 
 def radius_gather(

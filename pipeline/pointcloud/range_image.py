@@ -8,6 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from auglidar_base.errors import SettingsError
+
 
 @dataclass(frozen=True)
 class RangeGrid:
@@ -30,9 +32,9 @@ class RangeGrid:
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.az_steps < 1 or not (self.vertical > 0 and 0 < self.horizontal <= 360):
-            raise ValueError(f"range image: expected positive numbers of rows, columns and degrees, got {self}")
+            raise SettingsError(f"range image: expected positive numbers of rows, columns and degrees, got {self}")
         if len(self.origin) != 3:
-            raise ValueError(f"range image: expected an origin x y z, got {self.origin}")
+            raise SettingsError(f"range image: expected an origin x y z, got {self.origin}")
 
 
 def range_cells(points: NDArray[np.float32], grid: RangeGrid) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from auglidar_base.errors import SettingsError
 from pipeline.pointcloud.radius_gather import Radii
 
 # Cityscapes trainIds of what the thesis names: vehicles, pedestrians and cyclists.
@@ -35,9 +36,9 @@ class SemanticMask:
 
     def __post_init__(self) -> None:
         if self.dilate < 0:
-            raise ValueError(f"semantic mask: expected a dilation >= 0 pixels, got {self.dilate}")
+            raise SettingsError(f"semantic mask: expected a dilation >= 0 pixels, got {self.dilate}")
         if not 0 <= self.threshold <= 1:
-            raise ValueError(f"semantic mask: expected a threshold in [0, 1], got {self.threshold:g}")
+            raise SettingsError(f"semantic mask: expected a threshold in [0, 1], got {self.threshold:g}")
 
 
 def object_score(semantics: NDArray[Any], classes: tuple[int, ...]) -> NDArray[np.float32]:

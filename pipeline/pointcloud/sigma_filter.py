@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from auglidar_base.errors import SettingsError
 from completion.types import CompletedDepth
 
 
@@ -25,9 +26,9 @@ class SigmaBand:
 
     def __post_init__(self) -> None:
         if not 0 <= self.low <= self.high <= 1:
-            raise ValueError(f"sigma filter: expected 0 <= low <= high <= 1, got {self.low:g} and {self.high:g}")
+            raise SettingsError(f"sigma filter: expected 0 <= low <= high <= 1, got {self.low:g} and {self.high:g}")
         if not self.gap >= 0:
-            raise ValueError(f"sigma filter: expected a gap >= 0 m, got {self.gap:g}")
+            raise SettingsError(f"sigma filter: expected a gap >= 0 m, got {self.gap:g}")
 
 
 def sigma_filter(completed: CompletedDepth, band: SigmaBand) -> NDArray[np.bool_]:

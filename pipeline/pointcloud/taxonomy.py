@@ -20,6 +20,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from auglidar_base.errors import SettingsError
+
 UNKNOWN, CLEAN, NOISE_FG, NOISE_INBET, NOISE_BG = 0, 1, 2, 3, 4
 LABELS = ("unknown", "clean", "noise-fg", "noise-inbet", "noise-bg")
 # RGB for reports; readable for colour-blind readers (Okabe and Ito 2008).
@@ -42,7 +44,7 @@ class Taxonomy:
 
     def __post_init__(self) -> None:
         if min(self.base, self.slope, self.gap) < 0 or self.window < 1:
-            raise ValueError(f"taxonomy: expected thresholds >= 0 and a window >= 1 pixel, got {self}")
+            raise SettingsError(f"taxonomy: expected thresholds >= 0 and a window >= 1 pixel, got {self}")
 
 
 def label_noise(

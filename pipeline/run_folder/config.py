@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator, ValidationError, model_validator
 
 from detection.evaluation.protocol import EvaluationProtocol
 from pipeline.base.errors import UsageError
-from pipeline.base.settings import nearest_name, plain, with_changes
+from pipeline.base.settings import nearest_name, plain, renamed, with_changes
 from pipeline.base.yaml_files import parse_yaml, read_yaml
 
 
@@ -110,6 +110,11 @@ class TrainConfig(LibrarySection):
     beam_strides: tuple[int, ...] = ()
     # With beam_strides: standard deviation in degrees of a random rotation between LiDAR and camera.
     calibration_jitter: float = 0.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _names_of_today(cls, tree: Any) -> Any:
+        return renamed(tree, {"row_steps": "beam_strides"}, "train") if isinstance(tree, Mapping) else tree
 
 
 class RunConfig(Section):

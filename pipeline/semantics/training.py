@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -16,136 +16,217 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from auglidar_base.atomic import write_text
+from auglidar_base.devices import check_device, resolve_device
+from auglidar_base.errors import SettingsError
+from auglidar_base.progress import Pace, TrainProgress
+from auglidar_base.seeding import derived_seed, torch_seeded
 from completion.resume import load_state, save_state
 from completion.samples import Augmentation, disturb_image
-from completion.train import TrainProgress
-from pipeline.semantics.checkpoints import save_segmenter
+from completion.training_log import append_row, keep_rows
+from pipeline.semantics.checkpoints import read_segmenter, save_segmenter
 from pipeline.semantics.conventions import CLASSES, NONE
 from pipeline.semantics.network import StreetSegmenter
 from pipeline.semantics.pictures import LabelledImage, image_tensor
+from pipeline.semantics.validation import validation_figures
 
-LOG_EVERY = 50
+# What random numbers are for: a generator derives from (seed, purpose, step).
+_CROPS, _DROPOUT = 1, 2
 
 
 @dataclass(frozen=True)
 class SegmentationSettings:
     """One training run.
 
-    steps, batch  updates, crops per update        crop  (height, width) in pixels
-    rate          largest learning rate of one cosine cycle
-    zoom          crops are enlarged by up to this factor or reduced by its inverse
-    jitter, gamma, noise   of colours, as `completion.samples.Augmentation`; grey  share of crops without colour
+    steps            updates of the weights in all, over which the schedule runs
+    batch_size       crops of one update
+    learning_rate    largest of one cosine cycle
+    save_every       steps between saved states and last checkpoints
+    validate_every   steps between validations; 0: only at the end
+    device           "auto", "cpu", "cuda", "cuda:N" or "mps"
+    seed             of everything random
+    warm_start       weights (a path or a bundled name) of the same network to begin with
+    crop             (height, width) in pixels
+    zoom             crops are enlarged by up to this factor or reduced by its inverse
+    jitter           of colours, as `completion.samples.Augmentation`
+    gamma            of colours, as there
+    noise            of colours, as there
+    grey             share of crops without colour
+    validation_frames  frames of a validation, at most
+    best_by          the validation figure that chooses the best checkpoint, higher is better
+    log_every        steps between rows of log.csv
     """
 
+    RENAMED: ClassVar[Mapping[str, str]] = {"batch": "batch_size", "rate": "learning_rate"}
+
     steps: int = 3000
-    batch: int = 6
-    crop: tuple[int, int] = (256, 384)
-    rate: float = 3e-3
+    batch_size: int = 6
+    learning_rate: float = 3e-3
+    save_every: int = 50
+    validate_every: int = 0
+    device: str = "cpu"
     seed: int = 0
+    warm_start: str | None = None
+    crop: tuple[int, int] = (256, 384)
     zoom: float = 1.5
     jitter: float = 0.4
     gamma: float = 0.5
     noise: float = 8.0
     grey: float = 0.15
+    validation_frames: int = 50
+    best_by: str = "mean_iou"
+    log_every: int = 50
+
+    def __post_init__(self) -> None:
+        check_device(self.device)
+        for name in ("steps", "batch_size", "learning_rate", "save_every", "log_every"):
+            if not getattr(self, name) > 0:
+                raise SettingsError(f"{name}: expected a value > 0, got {getattr(self, name)}")
+
+    def identity(self, samples: int) -> str:
+        """JSON of everything that determines the weights; a run resumes only under the same one."""
+        values = asdict(self)
+        for free in ("save_every", "validate_every", "validation_frames", "best_by", "log_every", "device"):
+            del values[free]
+        return json.dumps(values | {"samples": samples}, sort_keys=True)
 
 
 def train_segmenter(
+    settings: SegmentationSettings,
     samples: Sequence[LabelledImage],
     out: Path,
-    settings: SegmentationSettings,
+    validation: Sequence[LabelledImage] = (),
     progress: Callable[[TrainProgress], None] | None = None,
 ) -> Path:
-    """Train on random crops by cross-entropy and write OUT.safetensors with its card OUT.json; returns the weights.
+    """Train on random crops by cross-entropy, or continue the run in `out`, and return the best checkpoint (the last
+    one without validation frames).
 
     Rare classes count more (inverse square root of their frequency in the first 50 samples). AdamW with one cosine
-    cycle. The same arguments give the same weights on one machine, also when the run was killed and started again: the
-    folder of OUT also holds state.safetensors and log.csv, written every 50 steps, when `progress` is called too.
+    cycle. The same arguments give the same weights on one machine, also when the run was killed and started again, and
+    the caller's random generators stay as they are. `out` receives state.safetensors (for resuming), last and best
+    .safetensors with cards, log.csv and validation.csv.
 
-    Raises ValueError without samples or steps, and for a state of other settings.
+    progress  called with every row of log.csv
+    Raises SettingsError without samples, and for a state of other settings.
     """
-    if not len(samples) or settings.steps < 1:
-        raise ValueError(f"segmentation training: expected samples and steps, got {len(samples)} and {settings.steps}")
-    run = _Run(samples, settings, out.parent)
-    begun_at, before = run.step, run.seconds
+    if not len(samples):
+        raise SettingsError("segmentation training: expected at least one sample, got none")
+    run = _Run(samples, settings, out)
     while run.step < settings.steps:
         run.optimise()
-        if run.step % LOG_EVERY == 0 or run.step == settings.steps:
-            loss = run.save()
+        finished = run.step == settings.steps
+        if finished or run.step % settings.log_every == 0:
+            losses = run.log()
             if progress is not None:
-                taken, done = run.seconds - before, run.step - begun_at
-                progress(TrainProgress.after(taken, done, run.step, settings.steps, {"loss": loss}))
-    training = asdict(settings) | {"samples": len(samples), "final_loss": run.log[-1][1]}
-    return save_segmenter(run.model.eval(), out, training | {"hours": round(run.seconds / 3600, 3)})
+                progress(run.pace.progress(run.step, settings.steps, losses, time.monotonic()))
+        validate = settings.validate_every > 0 and run.step % settings.validate_every == 0
+        if len(validation) and (finished or validate):
+            run.validate(validation)
+        if finished or run.step % settings.save_every == 0:
+            run.save()
+    best = out / "best.safetensors"
+    return best if best.is_file() else out / "last.safetensors"
+
+
+def _first_model(settings: SegmentationSettings) -> StreetSegmenter:
+    """The network before the first step, on the CPU."""
+    with torch_seeded(settings.seed, torch.device("cpu")):
+        model = StreetSegmenter()
+        if settings.warm_start is not None:
+            start, _ = read_segmenter(settings.warm_start)
+            if not isinstance(start, StreetSegmenter):
+                raise SettingsError(
+                    f"warm_start: {settings.warm_start} holds a {type(start).__name__}, not StreetSegmenter"
+                )
+            model.load_state_dict(start.state_dict())
+    return model
 
 
 class _Run:
-    """Network, optimiser, random numbers and files of one training."""
+    """Network, optimiser and files of one training."""
 
     def __init__(self, samples: Sequence[LabelledImage], settings: SegmentationSettings, folder: Path) -> None:
         self.samples, self.settings, self.folder = samples, settings, folder
-        torch.manual_seed(settings.seed)
-        self.random = np.random.default_rng(settings.seed)
-        self.model = StreetSegmenter().train().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.optimiser = torch.optim.AdamW(self.model.parameters(), lr=settings.rate, weight_decay=1e-4)
-        self.schedule = torch.optim.lr_scheduler.OneCycleLR(self.optimiser, settings.rate, total_steps=settings.steps)
-        self.weights = _class_weights(samples)
-        self.step, self.seconds = 0, 0.0
+        self.device = resolve_device(settings.device)
+        self.model: StreetSegmenter = _first_model(settings).to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        rate = settings.learning_rate
+        self.optimiser = torch.optim.AdamW(self.model.parameters(), lr=rate, weight_decay=1e-4)
+        self.schedule = torch.optim.lr_scheduler.OneCycleLR(self.optimiser, rate, total_steps=settings.steps)
+        self.weights = _class_weights(samples).to(self.device)
+        self.step, self.best = 0, -1.0
         self.losses: list[float] = []  # since the last row of the log
-        self.log: list[tuple[int, float]] = []
         self.scaler = torch.amp.GradScaler("cpu", enabled=False)  # part of a state's format
-        self._resume()
+        self.pace = Pace(*self._resume(), time.monotonic())
 
     def optimise(self) -> None:
         """One update."""
-        begun = time.monotonic()
-        images, labels = _crops(self.samples, self.settings, self.random)
+        settings = self.settings
+        random = np.random.default_rng([settings.seed, _CROPS, self.step])
+        images, labels = (part.to(self.device) for part in _crops(self.samples, settings, random))
         # At half size, as `NetworkSegmenter` labels: the 19 maps of full size would cost a quarter of the step.
         labels = labels[:, ::2, ::2]
-        logits = F.interpolate(self.model(images), size=labels.shape[-2:], mode="bilinear", align_corners=False)
-        loss = F.cross_entropy(logits, labels, weight=self.weights, ignore_index=NONE)
-        self.optimiser.zero_grad()
-        loss.backward()
+        self.model.train()
+        with torch_seeded(derived_seed(settings.seed, _DROPOUT, self.step), self.device):
+            logits = F.interpolate(self.model(images), size=labels.shape[-2:], mode="bilinear", align_corners=False)
+            loss = F.cross_entropy(logits, labels, weight=self.weights, ignore_index=NONE)
+            self.optimiser.zero_grad()
+            loss.backward()
         self.optimiser.step()
         self.schedule.step()
         self.losses.append(float(loss.detach()))
         self.step += 1
-        self.seconds += time.monotonic() - begun
 
-    def save(self) -> float:
-        """A row of the log, then the state; returns the mean loss since the last row."""
-        self.log.append((self.step, float(np.mean(self.losses))))
+    def log(self) -> dict[str, float]:
+        """A row of log.csv: means since the last row."""
+        means = {"loss": float(np.mean(self.losses))}
         self.losses = []
-        write_text(self.folder / "log.csv", "".join(f"{a},{b}\n" for a, b in [("step", "loss"), *self.log]))
+        append_row(self.folder / "log.csv", {"step": self.step} | means)
+        return means
+
+    def validate(self, validation: Sequence[LabelledImage]) -> None:
+        """A row of validation.csv; the best checkpoint is kept."""
+        frames = [validation[index] for index in range(min(len(validation), self.settings.validation_frames))]
+        figures = validation_figures(self.model.eval(), frames, self.device)
+        append_row(self.folder / "validation.csv", {"step": self.step} | figures)
+        if self.settings.best_by not in figures:
+            raise SettingsError(f"best_by: expected one of {', '.join(figures)}, got {self.settings.best_by!r}")
+        if figures[self.settings.best_by] >= self.best:
+            self.best = figures[self.settings.best_by]
+            self.checkpoint("best", {"validation": figures})
+
+    def checkpoint(self, name: str, facts: dict[str, Any]) -> None:
+        """NAME.safetensors with its card."""
+        hours = round(self.pace.spent(time.monotonic()) / 3600, 3)
+        described = asdict(self.settings) | {"samples": len(self.samples), "step": self.step, "hours": hours}
+        save_segmenter(self.model, self.folder / name, described | facts)
+
+    def save(self) -> None:
+        """The last checkpoint, then the state that the run resumes from."""
+        self.checkpoint("last", {})
         facts = {
-            "identity": self._identity,
+            "identity": self.settings.identity(len(self.samples)),
             "step": self.step,
-            "seconds": self.seconds,
-            "log": self.log,
-            "random": self.random.bit_generator.state,
+            "best": self.best,
+            "seconds": self.pace.spent(time.monotonic()),
+            "losses": self.losses,
             "groups": [{"lr": group["lr"], "betas": group["betas"]} for group in self.optimiser.param_groups],
         }
         save_state(self.folder / "state.safetensors", self.model, self.optimiser, self.scaler, facts)
-        return self.log[-1][1]
 
-    def _resume(self) -> None:
-        path = self.folder / "state.safetensors"
-        if not path.is_file():
-            return
-        facts = load_state(path, self.model, self.optimiser, self.scaler)
-        if facts["identity"] != self._identity:
-            raise ValueError(f"{path}: the state of a run with other settings; use another output folder or remove it")
-        self.step, self.seconds = facts["step"], facts["seconds"]
-        self.log = [(step, loss) for step, loss in facts["log"]]
-        self.random.bit_generator.state = facts["random"]
-        self.schedule.last_epoch = self.step
-        for group, values in zip(self.optimiser.param_groups, facts["groups"]):
-            group |= {"lr": values["lr"], "betas": tuple(values["betas"])}
-
-    @property
-    def _identity(self) -> str:
-        """What must agree for a run to be continued."""
-        return json.dumps(asdict(self.settings) | {"samples": len(self.samples)}, sort_keys=True)
+    def _resume(self) -> tuple[int, float]:
+        """The steps done and the seconds they took."""
+        path, seconds = self.folder / "state.safetensors", 0.0
+        if path.is_file():
+            facts = load_state(path, self.model, self.optimiser, self.scaler)
+            if facts["identity"] != self.settings.identity(len(self.samples)):
+                raise SettingsError(f"{path}: the state of a run with other settings; use another folder or remove it")
+            self.step, self.best, seconds = facts["step"], facts["best"], facts["seconds"]
+            self.losses = list(facts["losses"])
+            self.schedule.last_epoch = self.step
+            for group, values in zip(self.optimiser.param_groups, facts["groups"]):
+                group |= {"lr": values["lr"], "betas": tuple(values["betas"])}
+        for name in ("log.csv", "validation.csv"):
+            keep_rows(self.folder / name, self.step)
+        return self.step, seconds
 
 
 def _class_weights(samples: Sequence[LabelledImage]) -> Tensor:
@@ -163,7 +244,7 @@ def _crops(
     """(B, 3, h, w) images and (B, h, w) labels. Two crops are taken of every frame that is read."""
     colours = Augmentation(jitter=settings.jitter, gamma=settings.gamma, noise=settings.noise)
     images, labels = [], []
-    for number in range(settings.batch):
+    for number in range(settings.batch_size):
         if number % 2 == 0:
             sample = samples[int(random.integers(len(samples)))]
             whole, classes = sample.image, sample.semantics

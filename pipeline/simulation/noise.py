@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from auglidar_base.errors import SettingsError
 from completion.types import CompletedDepth
 
 Depth = NDArray[np.float32]
@@ -39,7 +40,7 @@ class NoiseSettings:
 
     def __post_init__(self) -> None:
         if min(self.dilate, self.blur, self.gap, self.slope, self.base) < 0 or not 0 <= self.drop <= 1:
-            raise ValueError(f"noise: expected values >= 0 and a drop-out in [0, 1], got {self}")
+            raise SettingsError(f"noise: expected values >= 0 and a drop-out in [0, 1], got {self}")
 
 
 def add_noise(depth: Depth, settings: NoiseSettings, seed: int) -> Depth:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from auglidar_base.errors import SettingsError
 from detection.kitti_format import KittiObject
 from pipeline.geometry.calibration import Calibration
 from pipeline.simulation.labels import ObjectTruth, kitti_labels, measure
@@ -42,14 +43,14 @@ class SynthSettings:
 
     def __post_init__(self) -> None:
         if self.frames < 1:
-            raise ValueError(f"frames: expected at least 1, got {self.frames}")
+            raise SettingsError(f"frames: expected at least 1, got {self.frames}")
         if self.layout not in FILE_LAYOUTS:
-            raise ValueError(f"layout: expected one of {', '.join(FILE_LAYOUTS)}, got {self.layout!r}")
+            raise SettingsError(f"layout: expected one of {', '.join(FILE_LAYOUTS)}, got {self.layout!r}")
         unknown = [name for name in self.streets if name not in LAYOUTS]
         if unknown or not self.streets:
-            raise ValueError(f"streets: expected names among {', '.join(LAYOUTS)}, got {unknown or 'none'}")
+            raise SettingsError(f"streets: expected names among {', '.join(LAYOUTS)}, got {unknown or 'none'}")
         if self.size is not None and (len(self.size) != 2 or min(self.size) < 16):
-            raise ValueError(f"size: expected (height, width) of at least 16 pixels, got {self.size}")
+            raise SettingsError(f"size: expected (height, width) of at least 16 pixels, got {self.size}")
         sensor(self.rows)
 
 

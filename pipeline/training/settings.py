@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
+from auglidar_base.errors import SettingsError
 from pipeline.base.errors import UsageError
 from pipeline.base.settings import with_changes
 from pipeline.run_folder.config import Config
@@ -28,17 +29,17 @@ def completion_settings(config: Config) -> CompletionSettings:
     architecture = str(model.get("architecture", "twise")) if isinstance(model, Mapping) else "twise"
     try:
         spec = default_spec(architecture)
-    except ValueError as error:
+    except SettingsError as error:
         raise UsageError(f"train.model: {error}") from None
     base = TrainSettings(spec, LossSettings(default_kind(spec)), seed=config.seed)
     return with_changes(base, changes, "train")
 
 
 def detection_settings(config: Config) -> DetectionSettings:
-    """Of `detection.train`."""
+    """Of `detection.train`; the detection section's device unless the section has its own."""
     from detection.train import TrainSettings
 
-    return with_changes(TrainSettings(seed=config.seed), config.train.library, "train")
+    return with_changes(TrainSettings(seed=config.seed, device=config.detection.device), config.train.library, "train")
 
 
 def segmentation_settings(config: Config) -> SegmentationSettings:

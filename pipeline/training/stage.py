@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
+from auglidar_base.errors import CheckpointError, SettingsError
+from auglidar_base.progress import TrainProgress
 from pipeline.base.errors import DataError, UsageError
 from pipeline.base.paths import RunFolder
 from pipeline.base.progress import duration
@@ -24,12 +27,20 @@ from pipeline.training.settings import completion_settings, detection_settings, 
 
 if TYPE_CHECKING:
     from completion.samples import TrainingSample
-    from completion.train import TrainProgress as DepthProgress
     from completion.types import DepthFrame
     from detection.kitti_format import KittiObject
     from detection.train import LabelledFrames
-    from detection.train import TrainProgress as DetectionProgress
     from detection.types import PointFrame
+
+T = TypeVar("T")
+
+
+def of_frame(frame: Frame, make: Callable[..., T], *parts: Any) -> T:
+    """`make(*parts)`; what it refuses (sizes that differ, NaN) is a fault of the frame. Raises DataError."""
+    try:
+        return make(*parts)
+    except ValueError as error:
+        raise DataError(frame.id, "a frame to train on", str(error)) from None
 
 
 @dataclass(frozen=True)
@@ -49,7 +60,7 @@ class DepthSamples:
 
         frame = self.dataset[index]
         camera = frame.calibration.K if frame.has("calibration") else None
-        sample = DepthFrame(frame.image, frame.sparse_depth, frame.target_depth, camera)
+        sample = of_frame(frame, DepthFrame, frame.image, frame.sparse_depth, frame.target_depth, camera)
         if not self.beam_strides:
             return sample
         return TrainingSample(sample, RandomBeamSubsampling.of(frame, self.beam_strides, self.calibration_jitter))
@@ -72,7 +83,8 @@ class CloudSamples:
         frame = self.dataset[index]
         points = cloud_of(uses_raw_lidar(self.config), frame, FrameOutputs(self.run, frame.id))
         camera = frame.calibration
-        return PointFrame(points, camera.T_cam_velo, camera.P2, frame.image_size, frame.id), frame.labels
+        size = frame.image_size
+        return of_frame(frame, PointFrame, points, camera.T_cam_velo, camera.P2, size, frame.id), frame.labels
 
 
 @dataclass(frozen=True)
@@ -109,10 +121,8 @@ def train_stage(config: Config, run: RunFolder) -> Path:
             return train_segmentation(config, dataset, out)
         if not dataset[0].has("labels"):
             raise UsageError(f"{dataset.root}: frame {dataset.ids[0]} has no label to train detection on")
-        return train_detection(config, cloud_samples(dataset, config, run), out)
-    except DataError:
-        raise
-    except ValueError as error:
+        return train_detection(config, dataset, run, out)
+    except (SettingsError, CheckpointError) as error:
         raise UsageError(f"train: {error}") from None
 
 
@@ -123,14 +133,31 @@ def train_completion(config: Config, dataset: Dataset, out: Path) -> Path:
     if not dataset[0].has("target_depth"):
         raise UsageError(f"{dataset.root}: frame {dataset.ids[0]} has no true depth to train completion on")
     settings = completion_settings(config)
-    held_back = min(settings.validation_frames, len(dataset) // 10) if settings.validate_every else 0
-    count = len(dataset) - held_back
-    samples = DepthSamples(
-        dataset.select(dataset.ids[:count]), config.train.beam_strides, config.train.calibration_jitter
-    )
-    validation = [_validation_frame(dataset[frame_id], config) for frame_id in dataset.ids[count:]]
+    dataset, held_back = split(dataset, settings)
+    samples = DepthSamples(dataset, config.train.beam_strides, config.train.calibration_jitter)
+    validation = [_validation_frame(held_back[frame_id], config) for frame_id in held_back.ids]
     facts = training_facts(config)
     return train(settings, samples, out, validation=validation, facts=facts, progress=print_progress)
+
+
+class Validated(Protocol):
+    """What the settings of the three trainers say about validation."""
+
+    @property
+    def validate_every(self) -> int: ...
+
+    @property
+    def validation_frames(self) -> int: ...
+
+
+def split(dataset: Dataset, settings: Validated) -> tuple[Dataset, Dataset]:
+    """(frames to train on, frames to validate on): the last `validation_frames`, at most a tenth, are held back.
+
+    None are without `validate_every`.
+    """
+    held_back = min(settings.validation_frames, len(dataset) // 10) if settings.validate_every else 0
+    count = len(dataset) - held_back
+    return dataset.select(dataset.ids[:count]), dataset.select(dataset.ids[count:])
 
 
 def _validation_frame(frame: Frame, config: Config) -> DepthFrame:
@@ -142,14 +169,18 @@ def _validation_frame(frame: Frame, config: Config) -> DepthFrame:
         if config.train.beam_strides
         else frame.sparse_depth
     )
-    return DepthFrame(frame.image, sparse, frame.target_depth)
+    return of_frame(frame, DepthFrame, frame.image, sparse, frame.target_depth)
 
 
-def train_detection(config: Config, samples: LabelledFrames, out: Path) -> Path:
-    """`detection.train` on labelled clouds."""
+def train_detection(config: Config, dataset: Dataset, run: RunFolder, out: Path) -> Path:
+    """`detection.train` on labelled clouds; with `beam_strides`, held-back frames are seen at 16 rows of 64."""
     from detection.train import train
 
-    return train(detection_settings(config), samples, out, config.detection.device, print_progress)
+    settings = detection_settings(config)
+    dataset, held_back = split(dataset, settings)
+    thinned = config.train.model_copy(update={"beam_strides": (4,) if config.train.beam_strides else ()})
+    validation = cloud_samples(held_back, config.model_copy(update={"train": thinned}), run)
+    return train(settings, cloud_samples(dataset, config, run), out, validation, print_progress)
 
 
 def train_segmentation(config: Config, dataset: Dataset, out: Path) -> Path:
@@ -159,15 +190,16 @@ def train_segmentation(config: Config, dataset: Dataset, out: Path) -> Path:
     if not dataset[0].has("semantics"):
         raise UsageError(f"{dataset.root}: frame {dataset.ids[0]} has no class map to train segmentation on")
     settings = segmentation_settings(config)
-    out.mkdir(parents=True, exist_ok=True)
+    dataset, held_back = split(dataset, settings)
     samples: Any = MaskSamples(dataset)
-    return train_segmenter(samples, out / "model", settings, print_progress)
+    validation: Any = MaskSamples(held_back)
+    return train_segmenter(settings, samples, out, validation, print_progress)
 
 
-def print_progress(progress: DepthProgress | DetectionProgress) -> None:
+def print_progress(progress: TrainProgress) -> None:
     """A line with the losses and the time that is left."""
     losses = "  ".join(f"{name} {value:.3g}" for name, value in progress.losses.items())
-    left = f"  about {duration(progress.eta_seconds)} left" if progress.step < progress.steps else ""
+    left = f"  about {duration(progress.eta)} left" if progress.step < progress.steps else ""
     print(f"step {progress.step} of {progress.steps}  {losses}{left}", flush=True)
 
 

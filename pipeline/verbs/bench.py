@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from auglidar_base.atomic import write_text
+from auglidar_base.errors import CheckpointError, SettingsError
 from pipeline.base.errors import UsageError
 
 COLUMNS = ("mae", "rmse", "tmae", "trmse", "mixed", "mixed_all", "edge_tmae", "missing", "seconds")
@@ -60,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         names, rows = _completers(args.completers), row_numbers(args.rows)
         detectors = _detection_rows(args.detectors, args.threshold)
-    except ValueError as error:
+    except (SettingsError, CheckpointError) as error:
         raise UsageError(str(error)) from None
     masks = {name: open_semantics(name) for name in args.masks.split(",") if name}
     labelled = all(dataset[frame_id].has("labels") for frame_id in dataset.ids)
@@ -83,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _completers(chosen: str | None) -> list[str]:
-    """The methods asked for. Raises ValueError for weights that do not exist."""
+    """The methods asked for. Raises CheckpointError for weights that do not exist."""
     from completion.checkpoints import find_weights
     from pipeline.benchmark.suite import WITHOUT_WEIGHTS
     from pipeline.run_folder.weights import bundled_names

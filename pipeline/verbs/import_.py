@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from auglidar_base.errors import CheckpointError
 from pipeline.base.errors import DataError, UsageError
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ def import_weights(path: Path, architecture: str, out: Path) -> Path:
         if architecture == BACKBONE:
             return _import_backbone(path, out)
         return _import_detector(path, architecture, out)
-    except ValueError as error:
+    except CheckpointError as error:
         raise DataError(path, f"a checkpoint of {architecture}", str(error)) from None
 
 

@@ -44,10 +44,10 @@ def settings(architecture: str, accumulate: int = 2) -> TrainSettings:
         epochs=2,
         steps_per_epoch=8,
         halve_every=1,
-        batch=1,
+        batch_size=1,
         accumulate=accumulate,
         validate_every=5,
-        checkpoint_steps=3,
+        save_every=3,
         log_every=2,
     )
 

@@ -21,10 +21,10 @@ def test_schedule_at_its_corners_and_middles() -> None:
         700: ((0.002 + 0.0002 / 1e4) / 2, 0.90),
     }
     for step, (rate, momentum) in expected.items():
-        assert one_cycle(step, steps, settings) == pytest.approx((rate, momentum))
-    last = one_cycle(999, steps, settings)
+        assert one_cycle(step, steps, 0.002, settings) == pytest.approx((rate, momentum))
+    last = one_cycle(999, steps, 0.002, settings)
     assert last[0] == pytest.approx(0.0002 / 1e4 + 0.002 / 2 * (1 + math.cos(math.pi * 599 / 600)), rel=1e-3)
-    assert one_cycle(0, 1, settings)[0] > 0
+    assert one_cycle(0, 1, 0.002, settings)[0] > 0
 
 
 def test_first_update_decays_everything_then_moves_by_the_rate() -> None:
@@ -32,7 +32,7 @@ def test_first_update_decays_everything_then_moves_by_the_rate() -> None:
     with torch.no_grad():
         model.weight.fill_(2.0)
         model.bias.fill_(-3.0)
-    optimiser = AdamOneCycle(model, 100, OneCycleSettings(peak=0.02, decay=0.5, clip=100.0))
+    optimiser = AdamOneCycle(model, 100, 0.02, OneCycleSettings(decay=0.5, clip=100.0))
     (model.weight.sum() * 3 + model.bias.sum() * 0.0).backward()
     norm = optimiser.step(0)
     rate = 0.002
@@ -45,7 +45,7 @@ def test_first_update_decays_everything_then_moves_by_the_rate() -> None:
 def test_gradient_is_clipped_by_its_norm() -> None:
     # With beta2's correction Adam's first step ignores size, so look at its memory: (1 - beta1) * clipped gradient.
     model = nn.Linear(1, 1, bias=False)
-    optimiser = AdamOneCycle(model, 100, OneCycleSettings(clip=1.0))
+    optimiser = AdamOneCycle(model, 100, 0.002, OneCycleSettings(clip=1.0))
     (model.weight.sum() * 50).backward()
     optimiser.step(0)
     assert optimiser.state_tensors()["exp_avg.weight"].item() == pytest.approx(0.05, rel=1e-4)

@@ -19,8 +19,8 @@ import torch
 from detection.checkpoints import load_checkpoint, load_tensors, save_tensors
 from detection.data_augmentation import PasteSettings
 from detection.kitti_format import KittiObject
-from detection.optimiser import OneCycleSettings
-from detection.train import Trainer, TrainProgress, TrainSettings, frame_order, train
+from detection.train import Trainer, TrainProgress, TrainSettings, train
+from detection.training_batches import frame_order
 from detection.types import PointFrame
 from tests.detection.scenes import BoxFrames, box_frame
 
@@ -55,7 +55,7 @@ def test_every_frame_once_per_epoch_whatever_the_processes() -> None:
 def test_training_writes_weights_card_state_and_log(tmp_path) -> None:
     told: list[TrainProgress] = []
     path = train(settings(), BoxFrames(3, cars=2), tmp_path, progress=told.append)
-    assert path == tmp_path / "model.safetensors"
+    assert path == tmp_path / "last.safetensors"
     _, preset, card = load_checkpoint(path)
     assert preset.options["points"] == 512
     assert (card["steps"], card["seed"], card["frames"]) == (6, 5, 3)
@@ -63,9 +63,8 @@ def test_training_writes_weights_card_state_and_log(tmp_path) -> None:
     assert [row["step"] for row in rows] == ["2", "4", "6"]
     parts = ("point_class", "point_box", "region_score", "region_box", "region_corner")
     assert float(rows[0]["loss"]) == pytest.approx(sum(float(rows[0][name]) for name in parts), rel=1e-4)
-    assert [(p.step, p.epoch) for p in told] == [(2, 0), (4, 1), (6, 1)]
-    assert told[-1].eta_seconds == 0
-    assert json.loads((tmp_path / "model.json").read_text())["training"]["steps"] == 6
+    assert [(p.step, p.steps, p.eta > 0) for p in told] == [(2, 6, True), (4, 6, True), (6, 6, False)]
+    assert json.loads((tmp_path / "last.json").read_text())["training"]["steps"] == 6
 
 
 def test_a_state_of_other_settings_is_refused(tmp_path) -> None:
@@ -89,7 +88,7 @@ def test_hours_count_what_was_trained_before(tmp_path) -> None:
     assert float(facts["seconds"]) > 0
     save_tensors(state, tensors, {**facts, "seconds": "7200"})
     train(settings(steps=2), frames, tmp_path)
-    assert 2 <= json.loads((tmp_path / "model.json").read_text())["hours"] < 2.1
+    assert 2 <= json.loads((tmp_path / "last.json").read_text())["hours"] < 2.1
 
 
 RUN = """
@@ -117,7 +116,7 @@ def test_killed_and_continued_equals_uninterrupted(tmp_path) -> None:
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    assert not (tmp_path / "killed" / "model.safetensors").exists()
+    assert json.loads((tmp_path / "killed" / "last.json").read_text())["steps"] < 12
     assert int(load_tensors(state)[1]["done"]) < 12
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -127,7 +126,7 @@ def test_killed_and_continued_equals_uninterrupted(tmp_path) -> None:
         train(settings(steps=12), frames, tmp_path / "whole")
     finally:
         torch.set_num_threads(threads)
-    assert same_weights(tmp_path / "killed" / "model.safetensors", tmp_path / "whole" / "model.safetensors")
+    assert same_weights(tmp_path / "killed" / "last.safetensors", tmp_path / "whole" / "last.safetensors")
     steps = [row["step"] for row in logged(tmp_path / "killed")]
     assert steps == ["2", "4", "6", "8", "10", "12"]
 
@@ -150,10 +149,10 @@ def test_two_processes_train_one_network(tmp_path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     for name in ("a", "b"):
         subprocess.run([sys.executable, str(script), str(tmp_path / name)], env=environment, cwd=ROOT, check=True)
-    assert same_weights(tmp_path / "a" / "model.safetensors", tmp_path / "b" / "model.safetensors")
+    assert same_weights(tmp_path / "a" / "last.safetensors", tmp_path / "b" / "last.safetensors")
     train(settings(steps=3), BoxFrames(3, cars=2), tmp_path / "alone")
-    assert not same_weights(tmp_path / "a" / "model.safetensors", tmp_path / "alone" / "model.safetensors")
-    assert json.loads((tmp_path / "a" / "model.json").read_text())["training"]["processes"] == 2
+    assert not same_weights(tmp_path / "a" / "last.safetensors", tmp_path / "alone" / "last.safetensors")
+    assert json.loads((tmp_path / "a" / "last.json").read_text())["training"]["processes"] == 2
 
 
 class Mixed(BoxFrames):
@@ -168,7 +167,7 @@ class Mixed(BoxFrames):
 
 @pytest.mark.parametrize(("name", "options", "own"), [("small", TINY, True), ("pointrcnn2", {}, False)])
 def test_frames_without_points_or_boxes(name, options, own) -> None:
-    trainer = Trainer(settings(preset=name, options=options), Mixed(3, cars=2), "cpu")
+    trainer = Trainer(settings(preset=name, options=options), Mixed(3, cars=2))
     boxes = []
     for step in range(3):
         batch = trainer.batch(step)
@@ -184,15 +183,15 @@ def test_no_usable_frame_is_an_error() -> None:
             return super().__getitem__(index)[0], []
 
     with pytest.raises(ValueError, match="none of the 2 frames"):
-        Trainer(settings(preset="pointrcnn", options={}), Empty(2, cars=1), "cpu").batch(0)
+        Trainer(settings(preset="pointrcnn", options={}), Empty(2, cars=1)).batch(0)
     with pytest.raises(ValueError, match="at least one frame"):
-        Trainer(settings(), BoxFrames(0), "cpu")
+        Trainer(settings(), BoxFrames(0))
 
 
 def test_pasted_objects_enter_the_batch() -> None:
     frames = BoxFrames(4, cars=3)
     pasting = settings(paste=PasteSettings(objects=(2, 2)), paste_frames=4, scene=None)
-    trainer = Trainer(pasting, frames, "cpu")
+    trainer = Trainer(pasting, frames)
     assert len(trainer.database) == 12
     assert max(len(trainer.batch(step).boxes[0]) for step in range(4)) > 3
 
@@ -201,7 +200,7 @@ def test_training_starts_from_given_weights(tmp_path) -> None:
     frames = BoxFrames(2, cars=2)
     path = train(settings(steps=2), frames, tmp_path / "old")
     wider = {**TINY, "features": ("height", "range", "intensity")}
-    trainer = Trainer(settings(options=wider, warm_start=str(path)), frames, "cpu")
+    trainer = Trainer(settings(options=wider, warm_start=str(path)), frames)
     old = load_tensors(path)[0]
     new = trainer.model.state_dict()
     assert torch.equal(new["points.class_hidden.conv.weight"], old["points.class_hidden.conv.weight"])
@@ -213,7 +212,7 @@ def test_training_starts_from_given_weights(tmp_path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["pointrcnn", "pointrcnn2"])
 def test_published_presets_train(name) -> None:
-    trainer = Trainer(settings(preset=name, options={}, scene=None), BoxFrames(1, cars=3), "cpu")
+    trainer = Trainer(settings(preset=name, options={}, scene=None), BoxFrames(1, cars=3))
     before = {key: value.clone() for key, value in trainer.model.state_dict().items()}
     losses = trainer.step(0)
     assert np.isfinite(list(losses.values())).all()
@@ -239,7 +238,7 @@ def test_eight_frames_are_learned_by_heart(tmp_path) -> None:
         steps=650,
         scene=None,
         # At 0.01 the outcome is a matter of rounding (AP 66 to 100).
-        optimiser=OneCycleSettings(peak=0.006),
+        learning_rate=0.006,
         save_every=1000,
     )
     try:
@@ -265,7 +264,7 @@ def test_box_frames_are_all_easy() -> None:
 )
 def test_a_preset_that_cannot_be_trained_is_refused(name, message) -> None:
     with pytest.raises(ValueError, match=message):
-        Trainer(TrainSettings(preset=name), BoxFrames(1), "cpu")
+        Trainer(TrainSettings(preset=name), BoxFrames(1))
 
 
 def test_scenes_kept_in_memory_change_nothing(tmp_path) -> None:

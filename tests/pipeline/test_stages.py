@@ -154,9 +154,9 @@ def test_synthetic_data_is_never_written_into_a_folder_of_the_users(tmp_path: Pa
 def test_training_segmentation_gives_weights_that_mask(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     options = ["--config", "kitti", "--data", str(data), "--out", str(out), "--workers", "1"]
-    options += ["--set", "train.network=segmentation", "--set", "train.steps=1", "--set", "train.batch=1"]
+    options += ["--set", "train.network=segmentation", "--set", "train.steps=1", "--set", "train.batch_size=1"]
     assert main([*options, "--set", "train.crop=[32, 64]", "--stage", "train"]) == 0
-    weights = out / "weights" / "segmentation" / "model.safetensors"
+    weights = out / "weights" / "segmentation" / "last.safetensors"
     masks = ["--set", "augment.preset=L_D_SF", "--set", f"augment.semantics=network:{weights}", "--stage", "augment"]
     assert main([*options[:8], *masks]) == 0
     steps = json.loads((out / "cloud" / "000000.json").read_text())["steps"]
@@ -170,7 +170,7 @@ def test_training_a_detector_gives_weights_that_detect(data: Path, tmp_path: Pat
     options += ["--set", "augment.preset=L", "--set", "train.network=detection", "--set", "train.steps=1"]
     options += ["--set", "train.options={points: 512, width: 0.25}", "--set", "train.batch_size=1"]
     assert main([*options, "--stage", "train"]) == 0
-    weights = out / "weights" / "detection" / "model.safetensors"
+    weights = out / "weights" / "detection" / "last.safetensors"
     assert main([*options, "--stage", "detect", "--set", f"detection.model={weights}"]) == 0
     assert len(list((out / "detections").glob("*.txt"))) == 3
 

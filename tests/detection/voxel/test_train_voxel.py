@@ -24,12 +24,12 @@ from detection.types import PointFrame
 from tests.detection.scenes import BoxFrames
 from tests.detection.voxel import tiny
 
-OPTIMISER = OneCycleSettings(peak=0.003, decay=0.01, clip=10.0)
+OPTIMISER = OneCycleSettings(decay=0.01, clip=10.0)
 
 
 def settings(preset: str, **changes: object) -> TrainSettings:
     base = TrainSettings(preset=preset, options={"classes": ["Car"]}, steps=2, batch_size=1, seed=3, save_every=1)
-    return replace(base, optimiser=OPTIMISER, **changes)  # type: ignore[arg-type]
+    return replace(base, learning_rate=0.003, optimiser=OPTIMISER, **changes)  # type: ignore[arg-type]
 
 
 class ColouredFrames(BoxFrames):
@@ -45,10 +45,10 @@ class ColouredFrames(BoxFrames):
 def test_a_run_continues_to_the_bit_with_augmentation_and_pasting(tmp_path) -> None:
     run = settings("pointpillars_small", paste=PasteSettings())
     whole = train(run, BoxFrames(2, cars=2), tmp_path / "whole")
-    trainer = Trainer(run, BoxFrames(2, cars=2), "cpu")
+    trainer = Trainer(run, BoxFrames(2, cars=2))
     trainer.step(0)
     (tmp_path / "parts").mkdir()
-    trainer.save(tmp_path / "parts" / "state.safetensors", 1)
+    trainer.save(tmp_path / "parts", 1)
     parts = train(run, BoxFrames(2, cars=2), tmp_path / "parts")
     first, second = load_tensors(whole)[0], load_tensors(parts)[0]
     assert all(torch.equal(first[name], second[name]) for name in first)
@@ -58,7 +58,7 @@ def test_a_run_continues_to_the_bit_with_augmentation_and_pasting(tmp_path) -> N
 
 def test_extra_columns_reach_the_network() -> None:
     run = settings("pointpillars_small", options={"features": ["intensity", "source"], "classes": ["Car"]})
-    batch = Trainer(run, ColouredFrames(1, cars=2), "cpu").batch(0)
+    batch = Trainer(run, ColouredFrames(1, cars=2)).batch(0)
     assert batch.points.shape == (1, 0, 5)
     assert set(batch.clouds[0][:, 4].tolist()) == {0.0, 1.0}
     assert batch.clouds[0][:, 0].min() > 0  # x points forward
@@ -99,7 +99,7 @@ def test_every_parameter_is_trained_and_statistics_move(build) -> None:
 )
 def test_two_frames_are_learnt_by_heart(preset, steps, overlap) -> None:
     frames = BoxFrames(2)
-    trainer = Trainer(settings(preset, steps=steps, scene=None), frames, "cpu")
+    trainer = Trainer(settings(preset, steps=steps, scene=None), frames)
     for step in range(steps):
         trainer.step(step)
     detector = Detector(trainer.model.eval(), trainer.preset, torch.device("cpu"))

@@ -90,7 +90,7 @@ def test_two_runs_and_a_continued_one_are_equal(out: Path, tmp_path: Path) -> No
     assert files[1].read_bytes() == first
     files[0].unlink()
     next((files[0].parent / "detections").glob("*.txt")).unlink()
-    next((tmp_path / "a" / "data").glob("trained-*/model.safetensors")).unlink()
+    next((tmp_path / "a" / "data").glob("trained-*/last.safetensors")).unlink()
     carry_out(type(plan)(Order((table,), tmp_path / "a", "smoke", 1), one.runs), lambda text: None)
     assert files[0].read_bytes() == first
     assert json.loads(first)["draws"]["bev_0.5_moderate"]
@@ -207,7 +207,7 @@ def test_fps_keeps_the_far_points() -> None:
 
 def test_all_rows_begin_with_one_detector(out: Path, results: Callable[[str, str], TableResult]) -> None:
     results("table", "5.8")
-    cards = [json.loads(path.read_text()) for path in (out / "data").glob("trained-*/model.json")]
+    cards = [json.loads(path.read_text()) for path in (out / "data").glob("trained-*/last.json")]
     starts = {card["training"]["warm_start"] for card in cards if card["training"]["preset"] == "small"}
     (start,) = starts - {None}
     assert Path(start).is_file()

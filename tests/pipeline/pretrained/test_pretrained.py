@@ -50,7 +50,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def a_run(folder: Path, room: str) -> Path:
     """A finished training run: the shipped weights and their card."""
     source = bundled_folder(ROOMS[room]) / f"{NAMES[room]}.safetensors"
-    target = folder / "weights" / room / "model.safetensors"
+    target = folder / "weights" / room / "last.safetensors"
     target.parent.mkdir(parents=True)
     shutil.copyfile(source, target)
     card = json.loads(source.with_suffix(".json").read_text())

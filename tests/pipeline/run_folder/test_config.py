@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
+import numpy as np
 import pytest
 
-from pipeline.base.errors import UsageError
+from auglidar_base.errors import SettingsError
+from pipeline.base.errors import RenamedSettingWarning, UsageError
 from pipeline.base.settings import nearest_name, plain, with_changes
-from pipeline.run_folder.config import Config, built_in_folder, dump_config, load_config
+from pipeline.run_folder.config import Config, built_in_folder, dump_config, load_config, parse_config
 
 BUILT_IN = sorted(path.stem for path in built_in_folder().glob("*.yaml"))
 
@@ -98,7 +101,7 @@ class Inner:
 
     def __post_init__(self) -> None:
         if self.size <= 0:
-            raise ValueError(f"size: expected > 0, got {self.size}")
+            raise SettingsError(f"size: expected > 0, got {self.size}")
 
 
 @dataclass(frozen=True)
@@ -137,6 +140,40 @@ def test_changes_reach_nested_settings() -> None:
 def test_changes_that_do_not_fit_are_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         with_changes(Outer(), changes, "outer")
+
+
+@dataclass(frozen=True)
+class Renewed:
+    RENAMED: ClassVar[dict[str, str]] = {"number": "count", "inner.peak": "rate", "inside": "inner"}
+
+    count: int = 1
+    rate: float = 0.1
+    inner: Inner = field(default_factory=lambda: Inner(0.5))
+
+
+def test_earlier_names_are_understood_with_a_warning() -> None:
+    with pytest.warns(RenamedSettingWarning, match=r"outer.number is called outer.count now"):
+        assert with_changes(Renewed(), {"number": 3}, "outer").count == 3
+    with pytest.warns(RenamedSettingWarning, match=r"outer.inner.peak is called outer.rate now"):
+        assert with_changes(Renewed(), {"inner": {"peak": 2, "size": 3}}, "outer") == Renewed(1, 2.0, Inner(3.0))
+    with pytest.warns(RenamedSettingWarning, match=r"outer.inside is called outer.inner now"):
+        assert with_changes(Renewed(), {"inside": {"size": 4}}, "outer").inner == Inner(4.0)
+    with pytest.raises(UsageError, match=r"outer.number is the earlier name of outer.count: give one of them"):
+        with_changes(Renewed(), {"number": 3, "count": 4}, "outer")
+    with pytest.warns(RenamedSettingWarning, match=r"train.row_steps is called train.beam_strides now"):
+        assert parse_config({"train": {"row_steps": [1, 4]}}, "file").train.beam_strides == (1, 4)
+
+
+def test_a_fault_in_settings_is_no_usage_error() -> None:
+    @dataclass(frozen=True)
+    class Faulty:
+        count: int = 1
+
+        def __post_init__(self) -> None:
+            np.zeros(2) + np.zeros(self.count + 2)
+
+    with pytest.raises(ValueError, match="could not be broadcast"):
+        with_changes(Faulty.__new__(Faulty), {"count": 1}, "faulty")
 
 
 def test_nearest_name_lists_all_when_nothing_is_similar() -> None:

@@ -14,7 +14,6 @@ import torch
 
 from completion.train import TrainProgress
 from pipeline.base.errors import DataError
-from pipeline.semantics import training
 from pipeline.semantics.checkpoints import load_segmenter, save_segmenter
 from pipeline.semantics.inference import NetworkSegmenter
 from pipeline.semantics.network import StreetSegmenter
@@ -52,9 +51,9 @@ def test_training_learns_and_weights_survive_the_file(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     samples = [picture(random) for _ in range(8)]
     seen: list[TrainProgress] = []
-    settings = SegmentationSettings(steps=60, batch=4, crop=(96, 128), zoom=1.1, jitter=0.2, gamma=0, grey=0)
-    path = train_segmenter(samples, tmp_path / "tiny", settings, progress=seen.append)
-    assert [(told.step, told.steps, told.eta_seconds > 0) for told in seen] == [(50, 60, True), (60, 60, False)]
+    settings = SegmentationSettings(steps=60, batch_size=4, crop=(96, 128), zoom=1.1, jitter=0.2, gamma=0, grey=0)
+    path = train_segmenter(settings, samples, tmp_path, progress=seen.append)
+    assert [(told.step, told.steps, told.eta > 0) for told in seen] == [(50, 60, True), (60, 60, False)]
     segmenter = load_segmenter(path)
     fresh = picture(np.random.default_rng(99))
     assert (segmenter.segment(fresh.image) == fresh.semantics).mean() > 0.9
@@ -81,8 +80,8 @@ def test_soft_source_gives_scores_and_network_source_labels(tmp_path: Path) -> N
 
 def test_training_is_repeatable(tmp_path: Path) -> None:
     samples = [picture(np.random.default_rng(1))]
-    settings = SegmentationSettings(steps=2, batch=1, crop=(64, 64), seed=3)
-    paths = [train_segmenter(samples, tmp_path / name, settings) for name in ("a", "b")]
+    settings = SegmentationSettings(steps=2, batch_size=1, crop=(64, 64), seed=3)
+    paths = [train_segmenter(settings, samples, tmp_path / name) for name in ("a", "b")]
     assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
@@ -98,23 +97,22 @@ class Failing(list[Sample]):
         return super().__getitem__(index)
 
 
-def test_stopped_and_continued_equals_uninterrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "LOG_EVERY", 2)
+def test_stopped_and_continued_equals_uninterrupted(tmp_path: Path) -> None:
     samples = Failing([picture(np.random.default_rng(seed)) for seed in range(3)])
-    settings = SegmentationSettings(steps=5, batch=2, crop=(64, 64), seed=3)
-    whole = train_segmenter(samples, tmp_path / "whole" / "model", settings)
+    settings = SegmentationSettings(steps=5, batch_size=2, crop=(64, 64), seed=3, save_every=2, log_every=2)
+    whole = train_segmenter(settings, samples, tmp_path / "whole")
     samples.last = 3 + 4  # three for the class weights, one per step: in the fourth step
     with pytest.raises(KeyboardInterrupt):
-        train_segmenter(samples, tmp_path / "parts" / "model", settings)
-    assert not (tmp_path / "parts" / "model.safetensors").exists()
-    parts = train_segmenter(samples, tmp_path / "parts" / "model", settings)
+        train_segmenter(settings, samples, tmp_path / "parts")
+    assert json.loads((tmp_path / "parts" / "last.json").read_text())["training"]["step"] == 2
+    parts = train_segmenter(settings, samples, tmp_path / "parts")
     assert parts.read_bytes() == whole.read_bytes()
     logs = [path.with_name("log.csv").read_text() for path in (parts, whole)]
     assert logs[0] == logs[1]
     assert [row.split(",")[0] for row in logs[0].splitlines()] == ["step", "2", "4", "5"]
     assert json.loads(parts.with_suffix(".json").read_text())["training"]["hours"] >= 0
     with pytest.raises(ValueError, match="other settings"):
-        train_segmenter(samples, tmp_path / "parts" / "model", replace(settings, seed=4))
+        train_segmenter(replace(settings, seed=4), samples, tmp_path / "parts")
 
 
 def test_weights_that_are_not_their_cards_are_refused(tmp_path: Path) -> None:
