@@ -19,18 +19,20 @@ from torch import Tensor, nn
 from auglidar_base.atomic import write_bytes
 from completion.checkpoints import Card
 from completion.cpu.hourglass import hourglass_forward
+from completion.cpu.propagation import nlspn_forward
 from completion.cpu.ring_coefficients import WinogradCoefficients
 from completion.cpu.selection import FusedSelection, WinogradSelection
 from completion.executors import Executor, NetworkExecutor, finest_of
 from completion.models import ModelSpec
 from completion.models.hourglass import Hourglasses
+from completion.models.nlspn import NLSPN
 from completion.models.ring_coefficients import RingCoefficients
 from completion.models.selection import INPUTS, Selection
 
 BACKENDS = ("torch", "numba", "onnxruntime", "openvino", "auto")
 # Pure convolutions; the others encode depth or are too large to be worth it.
 EXPORTABLE = ("selection", "twise", "msg_chn")
-OWN_KERNELS = (*EXPORTABLE, "ring_coefficients")
+OWN_KERNELS = (*EXPORTABLE, "ring_coefficients", "nlspn")
 OPSET = 17
 # Part of the file names: raise it when the exported part of a network changes.
 EXPORT_VERSION = 1
@@ -71,6 +73,9 @@ def kernel_executor(model: nn.Module, spec: ModelSpec, decoding: str) -> Executo
         return WinogradSelection(model, spec, decoding)
     if isinstance(model, RingCoefficients):
         return WinogradCoefficients(model, spec, decoding)
+    if isinstance(model, NLSPN):
+        moved = model.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+        return NetworkExecutor(nlspn_forward(moved), spec, decoding)
     assert isinstance(model, Hourglasses), type(model)
     return NetworkExecutor(hourglass_forward(model), spec, decoding)
 

@@ -13,6 +13,7 @@ from auglidar_base.errors import SettingsError
 from completion.depth_coefficients import Bins
 from completion.models.coefficients import CoefficientNetwork, CoefficientSparseToDense
 from completion.models.hourglass import MultiStack, Twise
+from completion.models.nlspn import NLSPN
 from completion.models.ring_coefficients import RingCoefficients
 from completion.models.selection import Selection
 from completion.models.sparse_to_dense import SparseToDense, TwinSparseToDense
@@ -87,6 +88,7 @@ MODELS: dict[str, Entry] = {
     ),
     "resnet_dc_to_dc": Entry(CoefficientSparseToDense, 1.0, "unit", "coefficients", 16),
     "ring_coefficients": Entry(RingCoefficients, 1.0, "standardised", "coefficients", 32),
+    "nlspn": Entry(NLSPN, 1.0, "standardised", "depth", 1),
     "selection": Entry(Selection, 1.0, "standardised", "mixture", 32),
 }
 

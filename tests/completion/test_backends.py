@@ -17,7 +17,7 @@ from completion.models import build_model, default_spec
 from tests.completion.scenes import street
 
 SMALL = {"selection": {"width": 8}, "twise": {"channels": 8}, "msg_chn": {"channels": 4}}
-OWN = {**SMALL, "ring_coefficients": {"width": 8}}
+OWN = {**SMALL, "ring_coefficients": {"width": 8}, "nlspn": {"layers": 18, "width": 8}}
 NEEDS = {"numba": (), "onnxruntime": ("onnx", "onnxruntime"), "openvino": ("onnx", "openvino")}
 
 
@@ -33,11 +33,14 @@ def saved(folder: Path, architecture: str, seed: int = 0) -> Path:
     model = build_model(spec)
     if architecture == "selection":
         torch.nn.init.normal_(model.network.head.weight, std=0.3)
+    if architecture == "nlspn":
+        torch.nn.init.normal_(model.prop_layer.conv_offset_aff.weight, std=0.3)
     return save_checkpoint(folder / f"{architecture}{seed}", model, Card(spec, default_decoding(spec)))
 
 
-@pytest.mark.parametrize("backend", sorted(NEEDS))
-@pytest.mark.parametrize("architecture", sorted(SMALL))
+@pytest.mark.parametrize(
+    ("architecture", "backend"), [*((name, backend) for name in sorted(SMALL) for backend in NEEDS), ("nlspn", "numba")]
+)
 def test_equal_to_torch_within_a_millimetre(tmp_path: Path, architecture: str, backend: str) -> None:
     for package in NEEDS[backend]:
         pytest.importorskip(package)
