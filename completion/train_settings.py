@@ -25,6 +25,8 @@ class TrainSettings:
     gradients of 4 samples, scales (1, 1, 1) for 10 epochs, (1, 0.1, 0.1) for 10, then (1, 0, 0).
 
     model            network and input scaling
+    loss             what training minimises
+    augmentation     disturbances of the samples
     steps            updates of the weights in all, over which the schedules run; None: `epochs`
     batch_size       samples of one backward pass, per process; `accumulate` passes make an update
     learning_rate    largest of the schedule

@@ -13,11 +13,11 @@ from torch import Tensor, nn
 class OneCycleSettings:
     """One-cycle schedule (Smith and Topin 2017) with cosine annealing.
 
-    division start = peak / division; end = start / 10000, where peak is the learning rate of the settings
-    rising   share of the steps with a rising rate
-    momentum (high, low) of beta1, which runs against the rate
-    decay    decoupled weight decay, times the learning rate, on every parameter (biases and normalisation too)
-    clip     largest norm of the gradient
+    division  start = peak / division; end = start / 10000, where peak is the learning rate of the settings
+    rising    share of the steps with a rising rate
+    momentum  (high, low) of beta1, which runs against the rate
+    decay     decoupled weight decay, times the learning rate, on every parameter (biases and normalisation too)
+    clip      largest norm of the gradient
     """
 
     division: float = 10.0

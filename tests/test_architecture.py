@@ -26,7 +26,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("runner",),
     ("synthetic", "report", "export", "check", "scoring", "training"),
     ("experiments", "benchmark", "pretrained"),
-    ("summary", "run", "cli", "verbs"),
+    ("summary", "reference", "run", "cli", "verbs"),
 )
 # Reproduction and measuring: the way in is a verb, no stage of a run needs them.
 REACHED_FROM_VERBS_ONLY = {"experiments", "benchmark", "pretrained"}

@@ -20,7 +20,7 @@ Representative = Literal["nearest", "first", "centroid"]
 class GridSampling:
     """The grid.
 
-    size            edge of a cell in metres (thesis: 0.2 in 5.3.4.2 and Fig. 5.7, 0.1 in Tables 5.5 and 5.7)
+    size            edge of a cell in metres (0.2 in thesis 5.3.4.2 and Fig. 5.7; 0.1 in Tables 5.5 and 5.7)
     representative  "nearest": the point nearest to the mean of its cell; "first": in row order; "centroid": the mean
     """
 

@@ -22,16 +22,17 @@ COLUMNS = (*SEMANTIC_COLUMNS, *SURFACE_COLUMNS, "nearest_return")
 class AugmentSettings:
     """The steps of thesis 5.3.4 in their order; None leaves a step out.
 
-    lidar           raw LiDAR in the output
-    completed       completed depth in the output
+    lidar           raw LiDAR in the output (Table 5.3)
+    completed       completed depth in the output (Table 5.3)
     crop_lidar      use only raw returns that the camera sees (about 18k of 115k in KITTI), as completed points are
-    sigma           sigma filter
+    sigma           sigma filter (thesis 5.3.4.1)
     range_image     azimuth-elevation resampling (Tables 5.5, 5.7)
-    grid            grid sampling
-    classes         relevant Cityscapes trainIds
-    semantic        semantic mask and context; None with the column "semantic" is the soft variant: all kept, scored
+    grid            grid sampling (thesis 5.3.4.2)
+    classes         relevant Cityscapes trainIds (thesis 5.3.4.2)
+    semantic        semantic mask and context (thesis 5.3.4.2); None with the column "semantic" is the soft variant: all
+                    kept, scored
     semantic_lidar  apply the semantic mask to the raw LiDAR too (Table 5.6, "Sem. Lidar")
-    near_lidar      gathering around raw LiDAR
+    near_lidar      gathering around raw LiDAR (thesis 5.3.4.3)
     columns         extra columns: semantic (flag or score), sigma, gap (background - foreground, m),
                     expected_error (m), nearest_return (distance to the nearest raw return, m)
     max_points      most points in the output, 0 = no limit; measured points stay first

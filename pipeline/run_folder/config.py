@@ -39,7 +39,10 @@ class LibrarySection(BaseModel):
 class DataConfig(Section):
     """Where frames come from."""
 
-    name: str = Field(default="synthetic", description="kitti_object, ..., or synthetic (made by the synth stage)")
+    name: str = Field(
+        default="synthetic",
+        description="kitti_object, kitti_depth, kitti_raw, vkitti2, nyuv2, folder; synthetic: made by the synth stage",
+    )
     root: str | None = Field(default=None, description="folder of the data set; synthetic data defaults to OUT/data")
     frames: str | None = Field(default=None, description="a:b (positions), a split file, or ids separated by commas")
     columns: int | None = Field(
@@ -58,8 +61,8 @@ class CompletionConfig(Section):
     """Depth completion."""
 
     model: str = Field(default="classical", description="bundled weights by name, a checkpoint file, or 'classical'")
-    backend: str = "torch"
-    device: str = "cpu"
+    backend: str = Field(default="torch", description="what computes it: torch, numba, onnxruntime, openvino or auto")
+    device: str = Field(default="cpu", description="where torch computes it: cpu, cuda or mps")
 
 
 class AugmentConfig(LibrarySection):
@@ -79,7 +82,7 @@ class DetectionConfig(Section):
     """The 3D detector."""
 
     model: str = Field(default="auto", description="bundled weights by name, a checkpoint file, or 'auto' (by preset)")
-    device: str = "cpu"
+    device: str = Field(default="cpu", description="where it is computed: cpu or cuda")
 
 
 def _protocol(value: object) -> EvaluationProtocol:
@@ -104,12 +107,18 @@ class ReportConfig(Section):
 class TrainConfig(LibrarySection):
     """Training; other keys: the `TrainSettings` of the network's library."""
 
-    network: Literal["completion", "detection", "segmentation"] = "completion"
-    # Every n-th LiDAR ring, e.g. [1, 2, 4, 8]. Completion draws n for every crop; detection sees every frame once with
-    # each n. None: the frame's sparse map, the run's clouds.
-    beam_strides: tuple[int, ...] = ()
-    # With beam_strides: standard deviation in degrees of a random rotation between LiDAR and camera.
-    calibration_jitter: float = 0.0
+    network: Literal["completion", "detection", "segmentation"] = Field(
+        default="completion", description="what is trained: completion, detection or segmentation"
+    )
+    beam_strides: tuple[int, ...] = Field(
+        default=(),
+        description="every n-th LiDAR ring, e.g. [1, 2, 4, 8]: completion draws n for every crop, detection sees every "
+        "frame once with each n; none: the frame's sparse map, the run's clouds",
+    )
+    calibration_jitter: float = Field(
+        default=0.0,
+        description="with beam_strides: standard deviation, degrees, of a random rotation between LiDAR and camera",
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -129,7 +138,7 @@ class RunConfig(Section):
 class Config(Section):
     """A whole run."""
 
-    seed: int = Field(default=1, ge=0, lt=2**31)
+    seed: int = Field(default=1, ge=0, lt=2**31, description="of everything random in the run")
     data: DataConfig = DataConfig()
     synth: SynthConfig = SynthConfig()
     completion: CompletionConfig = CompletionConfig()

@@ -25,7 +25,8 @@ FILE_LAYOUTS = ("kitti", "kitti_depth", "vkitti2")
 class SynthSettings:
     """What to generate.
 
-    frames   how many; seed: of everything
+    frames   how many
+    seed     of everything random
     layout   of the files: "kitti" (object set), "kitti_depth" (depth completion set) or "vkitti2"
     size     (height, width) in pixels, or None for KITTI's own five cameras
     rows     LiDAR rows: 64, 32, 16 or 8
