@@ -27,7 +27,7 @@ class TrainSettings:
     seed             of everything random
     warm_start       weights (a path or a bundled name) to begin with: of the same network or of its first stage alone;
                      input channels they lack start at zero, classes as a copy of similar ones
-    preset           the detector, PRESETS[preset](**options)
+    preset           the detector: a name in `detection.models.presets.PRESETS`, built with `options`
     options          arguments of the preset
     optimiser        shape of the one-cycle schedule
     scene            scene augmentation, or None (the thesis uses none)
