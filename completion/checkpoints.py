@@ -141,7 +141,7 @@ def _fitting_model(spec: ModelSpec, tensors: Mapping[str, torch.Tensor], path: P
     raise CheckpointError(f"{path}: does not fit the network of its card: {found}")
 
 
-def convert_checkpoint(path: str | Path, architecture: str, out: str | Path) -> Path:
+def convert_checkpoint(path: str | Path, architecture: str, out: str | Path, **choices: object) -> Path:
     """Import a published file (see `import_checkpoint`) and write it with a card; returns the safetensors path."""
-    model, spec, facts = import_with_spec(path, architecture)
+    model, spec, facts = import_with_spec(path, architecture, **choices)
     return save_checkpoint(out, model, Card(spec, default_decoding(spec), facts))

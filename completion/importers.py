@@ -1,4 +1,4 @@
-"""Reading the published checkpoint files of TWISE, MSG-CHN and sparse-to-dense without running anything in them.
+"""Reading the published checkpoint files of TWISE, MSG-CHN, sparse-to-dense and NLSPN without running anything in them.
 
 These are pickles of PyTorch 0.4 to 1.3, legacy or zip; `auglidar_base.torch_pickle` reads them.
 """
@@ -13,12 +13,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from auglidar_base.errors import CheckpointError
+from auglidar_base.errors import CheckpointError, SettingsError
 from auglidar_base.torch_pickle import read_torch_pickle
 from completion.models import ModelSpec, build_model, default_spec
+from completion.nlspn_import import nlspn_spec
 from completion.state_dicts import Match, fill, match
 
-ARCHITECTURES = ("twise", "twise_maxpool", "msg_chn", "msg_chn_wacv", "sparse_to_dense")
+ARCHITECTURES = ("twise", "twise_maxpool", "msg_chn", "msg_chn_wacv", "sparse_to_dense", "nlspn")
 
 
 def read_tensors(path: str | Path) -> dict[str, Tensor]:
@@ -78,12 +79,26 @@ SPECS: dict[str, Callable[[Mapping[str, Tensor]], ModelSpec]] = {
 }
 
 
-def _prepare(path: str | Path, architecture: str) -> tuple[nn.Module, ModelSpec, dict[str, Tensor]]:
+# Those whose files leave more open than a name can say; the user's choices by name.
+ASKING: dict[str, Callable[[Mapping[str, Tensor], Mapping[str, object]], ModelSpec]] = {"nlspn": nlspn_spec}
+
+
+def _spec(architecture: str, tensors: Mapping[str, Tensor], choices: Mapping[str, object]) -> ModelSpec:
+    if architecture in ASKING:
+        return ASKING[architecture](tensors, choices)
+    if choices:
+        raise SettingsError(f"{architecture} leaves nothing to choose, got {', '.join(choices)}")
+    return SPECS[architecture](tensors)
+
+
+def _prepare(
+    path: str | Path, architecture: str, choices: Mapping[str, object]
+) -> tuple[nn.Module, ModelSpec, dict[str, Tensor]]:
     """An empty network of the file's size and the file's tensors."""
-    if architecture not in SPECS:
+    if architecture not in ARCHITECTURES:
         raise ValueError(f"architecture: expected one of {', '.join(ARCHITECTURES)}, got {architecture!r}")
     tensors = read_tensors(path)
-    spec = SPECS[architecture](tensors)
+    spec = _spec(architecture, tensors, choices)
     with torch.random.fork_rng(devices=[]):
         model = build_model(spec)
     for name, value in model.state_dict().items():
@@ -93,13 +108,13 @@ def _prepare(path: str | Path, architecture: str) -> tuple[nn.Module, ModelSpec,
     return model, spec, tensors
 
 
-def compare_checkpoint(path: str | Path, architecture: str) -> Match:
+def compare_checkpoint(path: str | Path, architecture: str, **choices: object) -> Match:
     """Which tensors of the file match the architecture and which do not. CheckpointError for an unreadable file."""
-    model, _, tensors = _prepare(path, architecture)
+    model, _, tensors = _prepare(path, architecture, choices)
     return match(model, tensors)
 
 
-def import_checkpoint(path: str | Path, architecture: str) -> nn.Module:
+def import_checkpoint(path: str | Path, architecture: str, **choices: object) -> nn.Module:
     """The published network with the file's weights, in evaluation mode on the CPU.
 
     architecture and call of the result:
@@ -107,20 +122,27 @@ def import_checkpoint(path: str | Path, architecture: str) -> nn.Module:
         "msg_chn", "msg_chn_wacv"  model(sparse in m, rgb / 255) -> (out_1, out_2, out_4), full-size metres; with and
                                    without the extra skips
         "sparse_to_dense"          model(sparse in m, rgb in 0..255) -> metres, never below 0.9 m in evaluation mode
-    Width and depth are taken from the tensors. CheckpointError when the file is refused or does not fit.
+        "nlspn"                    model(sparse in m, rgb standardised) -> metres >= 0; the choices legacy=..., and
+                                   preserve_input=... must be given, see `nlspn_import.nlspn_spec`
+    Width and depth are taken from the tensors. CheckpointError when the file is refused or does not fit,
+    SettingsError when a choice is missing or is none of the architecture's.
     """
-    return import_with_spec(path, architecture)[0]
+    return import_with_spec(path, architecture, **choices)[0]
 
 
-def import_with_spec(path: str | Path, architecture: str) -> tuple[nn.Module, ModelSpec, dict[str, Any]]:
+def import_with_spec(
+    path: str | Path, architecture: str, **choices: object
+) -> tuple[nn.Module, ModelSpec, dict[str, Any]]:
     """As `import_checkpoint`, with the network's input scaling and the facts for its card."""
-    model, spec, tensors = _prepare(path, architecture)
+    model, spec, tensors = _prepare(path, architecture, choices)
     fill(model, tensors, f"{path} as {architecture!r}")
-    facts = {
+    facts: dict[str, Any] = {
         "imported_from": Path(path).name,
         "source_sha256": hashlib.sha256(Path(path).read_bytes()).hexdigest(),
         "architecture": architecture,
     }
     if architecture.startswith("twise"):
         facts["gamma"] = "2.5 (name of the published file; the thesis' default is 2.0)"
+    if architecture in ASKING:
+        facts["choices"] = dict(choices)
     return model.eval(), spec, facts

@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from auglidar_base.errors import CheckpointError
+from auglidar_base.errors import CheckpointError, SettingsError
 from pipeline.base.errors import DataError, UsageError
 
 if TYPE_CHECKING:
@@ -35,9 +36,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--architecture",
         required=True,
         metavar="NAME",
-        help="twise, twise_maxpool, msg_chn, msg_chn_wacv, sparse_to_dense; pointrcnn, epnet, openpcdet_pointrcnn, "
-        "pointpillar, second, voxel_rcnn, pv_rcnn; efficientnet_lite0 (backbone to train a segmentation network on); "
-        "or 'results' for a result pickle",
+        help="twise, twise_maxpool, msg_chn, msg_chn_wacv, sparse_to_dense, nlspn; pointrcnn, epnet, "
+        "openpcdet_pointrcnn, pointpillar, second, voxel_rcnn, pv_rcnn; efficientnet_lite0 (backbone to train a "
+        "segmentation network on); or 'results' for a result pickle",
+    )
+    parser.add_argument(
+        "--choose",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="what the file does not tell, repeatable; nlspn: legacy and preserve_input, both true for the authors' "
+        "released weights, and affinity (AS, ASS, TC, TGASS), iterations (18)",
     )
     out = "NAME.safetensors, or the folder of result files"
     parser.add_argument("--out", type=Path, required=True, metavar="FILE|DIR", help=out)
@@ -56,16 +65,31 @@ def run(args: argparse.Namespace) -> int:
         return 0
     if args.out.suffix != ".safetensors":
         raise UsageError(f"--out {args.out}: expected a name that ends in .safetensors")
-    written = import_weights(args.path, args.architecture, args.out)
+    written = import_weights(args.path, args.architecture, args.out, parsed_choices(args.choose))
     card = written.with_suffix(".json")
     print(json.dumps({"weights": str(written), "card": str(card)}) if args.json else f"{written} and {card.name}")
     return 0
 
 
-def import_weights(path: Path, architecture: str, out: Path) -> Path:
+def parsed_choices(given: list[str]) -> dict[str, object]:
+    """NAME=VALUE pairs; true, false and whole numbers as such. Raises UsageError for anything else than a pair."""
+    found: dict[str, object] = {}
+    for pair in given:
+        name, equals, value = pair.partition("=")
+        if not (name and equals and value):
+            raise UsageError(f"--choose {pair}: expected NAME=VALUE, e.g. legacy=true")
+        truth = {"true": True, "false": False}.get(value.lower())
+        found[name] = truth if truth is not None else int(value) if value.isdecimal() else value
+    return found
+
+
+def import_weights(path: Path, architecture: str, out: Path, choices: Mapping[str, object] | None = None) -> Path:
     """Writes a public checkpoint as safetensors with a card; nothing in the file is executed.
 
-    Raises UsageError for an unknown architecture, DataError when the file does not fit it.
+    choices  what the file does not tell, see `completion.checkpoints.import_checkpoint`
+
+    Raises UsageError for an unknown architecture and for choices that are missing or not offered, DataError
+    when the file does not fit it.
     """
     from completion.importers import ARCHITECTURES
     from detection.models.presets import IMPORTED_PRESETS
@@ -77,10 +101,14 @@ def import_weights(path: Path, architecture: str, out: Path) -> Path:
         if architecture in ARCHITECTURES:
             from completion.checkpoints import convert_checkpoint
 
-            return convert_checkpoint(path, architecture, out)
+            return convert_checkpoint(path, architecture, out, **(choices or {}))
+        if choices:
+            raise UsageError(f"--choose: {architecture} leaves nothing to choose")
         if architecture == BACKBONE:
             return _import_backbone(path, out)
         return _import_detector(path, architecture, out)
+    except SettingsError as error:
+        raise UsageError(str(error)) from None
     except CheckpointError as error:
         raise DataError(path, f"a checkpoint of {architecture}", str(error)) from None
 

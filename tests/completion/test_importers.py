@@ -161,7 +161,7 @@ def test_no_pytorch_file(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"expected a PyTorch checkpoint|refused"):
         import_checkpoint(tmp_path / "text.pth", "twise")
     with pytest.raises(ValueError, match="architecture"):
-        import_checkpoint(tmp_path / "text.pth", "nlspn")
+        import_checkpoint(tmp_path / "text.pth", "no_such_network")
 
 
 def test_conversion_to_our_format(tmp_path: Path) -> None:
