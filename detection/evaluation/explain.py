@@ -196,7 +196,7 @@ class _Story:
         labels = self.matcher.pair.labels
         pairs = self.of_detection.get(d, [])
         if not pairs:
-            return "nothing there", ""
+            return self._why_nothing(d)
         g, iou = max(pairs, key=lambda pair: pair[1])
         where = f"line {labels.line[g]}, IoU {iou:.3f}"
         if iou <= self.target.iou:
@@ -204,6 +204,13 @@ class _Story:
         if self.label_flag[g] == INVISIBLE:
             return "wrong class", f"line {labels.line[g]} is {labels.types[labels.type[g]]}"
         return "label found by another detection", where
+
+    def _why_nothing(self, d: int) -> tuple[str, str]:
+        """No label is near: DontCare areas excuse a detection only where rectangles in the image are compared."""
+        share = float(self.matcher.overlaps("2d").dontcare[d])
+        if share > 0.5:
+            return "in a DontCare area", f"share {share:.3f}, which this metric counts all the same"
+        return "nothing there", ""
 
     def _iou(self, g: int, d: int) -> float:
         return next(iou for label, iou in self.of_detection[d] if label == g)

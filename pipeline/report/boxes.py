@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -9,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detection.boxes import corners
-from detection.evaluation.explain import Explanation
+from detection.evaluation.explain import FALSE_POSITIVE, MISSED, Explanation
 from detection.kitti_format import KittiObject, boxes_of
 from pipeline.geometry.calibration import Calibration
-from pipeline.report.matches import is_wrong, verdict_text
+from pipeline.report.matches import verdict_text
 from pipeline.report.pictures import BirdsEye
 
 # Pairs of corners (order of detection.boxes.corners: bottom face, then top face) that make the twelve edges.
@@ -28,8 +29,9 @@ class DrawnBox:
     """One object: SVG path data in image pixels and in bird's-eye pixels, and the text shown when pointed at.
 
     corners  (8, 3) metres, LiDAR frame, bottom face first
-    wrong    a missed label or a false positive
+    status   what became of it: "matched", "missed", "false positive", "ignored", or "" where nothing was compared
     met      of a label that was found: the score of the detection that found it
+    place    (x, y) pixels of the top left corner of the wireframe in the image, for its name
     """
 
     kind: str
@@ -38,8 +40,14 @@ class DrawnBox:
     title: str
     score: float | None
     corners: NDArray[np.float64]
-    wrong: bool = False
+    status: str = ""
     met: float | None = None
+    place: tuple[float, float] | None = None
+
+    @property
+    def wrong(self) -> bool:
+        """A missed label or a false positive."""
+        return self.status in (MISSED, FALSE_POSITIVE)
 
 
 def drawn_boxes(
@@ -65,7 +73,8 @@ def drawn_boxes(
         title = ", ".join(filter(None, (_title(item), verdict_text(verdict))))
         velo = calibration.cam_to_velo(points)
         met = partners[verdict.partner - 1].score if partners and verdict is not None and verdict.partner else None
-        found.append(DrawnBox(item.type, *paths, title, item.score, velo, is_wrong(verdict), met))
+        status = verdict.status if verdict is not None else ""
+        found.append(DrawnBox(item.type, *paths, title, item.score, velo, status, met, name_place(paths[0], size)))
     return found
 
 
@@ -92,6 +101,15 @@ def wireframe(points: NDArray[np.float64], calibration: Calibration, size: tuple
         if not outside:
             lines.append(f"M{u1:.1f} {v1:.1f}L{u2:.1f} {v2:.1f}")
     return "".join(lines)
+
+
+def name_place(path: str, size: tuple[int, int]) -> tuple[float, float] | None:
+    """(x, y) of the top left corner of a wireframe's path data, inside an image of (height, width); None without."""
+    numbers = np.array(re.findall(r"-?\d+\.\d", path), np.float64).reshape(-1, 2)
+    if not len(numbers):
+        return None
+    x, y = numbers.min(axis=0)
+    return float(np.clip(x, 0, size[1] - 60)), float(np.clip(y, 14, size[0]))
 
 
 def _in_front(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64] | None:

@@ -153,10 +153,10 @@ const AugCloud = (() => {
 
     lines(place, ratio) {
       const body = document.body.classList, shown = { truth: !body.contains("no-truth"), found: !body.contains("no-found"), other: !body.contains("no-found") };
-      const colours = { truth: "#2bd4a4", found: "#ff8a3d", other: "#c48bff" }, least = AugCloud.least;
+      const colours = { truth: "#2bd4a4", found: "#ff8a3d", other: "#c48bff" }, leastOf = (name) => AugCloud.least[name] ?? -Infinity;
       for (const box of this.boxes) {
-        if (!shown[box.kind] || (box.kind === "found" && box.score < least)) continue;
-        const corners = box.corners.map((corner) => place(...corner)), wrong = box.wrong || (box.met !== null && box.met < least);
+        if (!shown[box.kind] || (box.kind === "found" && box.score < leastOf(box.class))) continue;
+        const corners = box.corners.map((corner) => place(...corner)), wrong = box.wrong || (box.met !== null && box.met < leastOf(box.class));
         this.context.strokeStyle = colours[box.kind];
         this.context.lineWidth = (wrong ? 2.6 : 1.5) * ratio;
         this.context.setLineDash(wrong ? [5 * ratio, 3 * ratio] : []);
@@ -257,5 +257,5 @@ const AugCloud = (() => {
     return view;
   };
   const redraw = () => { for (const view of views.values()) if (view) view.soon(); };
-  return { open, redraw, least: -Infinity };
+  return { open, redraw, least: {} };
 })();

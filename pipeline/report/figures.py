@@ -5,7 +5,6 @@ Fonts are embedded (TrueType in PDF, outlines in SVG); colours are told apart wi
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from pipeline.report import panels
 from pipeline.report.matches import MatchedFrames, strictest
 from pipeline.run_folder.config import Config
 from pipeline.run_folder.frame_outputs import FrameOutputs
+from pipeline.run_folder.thresholds import ScoreThresholds
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -86,19 +86,19 @@ def write_figures(
     dataset: Dataset,
     frames: Sequence[str],
     matched: MatchedFrames,
-    least: float = -math.inf,
+    least: ScoreThresholds | None = None,
 ) -> list[Path]:
     """Writes report/figures/*.png|pdf|svg (`report.format`) and returns their paths.
 
     The frame shown is the one with the most labelled objects among the first `report.frames`; a figure whose data the
-    run does not have (no detections, no true depth) is left out. Detections are drawn from score `least` on.
+    run does not have (no detections, no true depth) is left out. Detections are drawn from the scores `least` on.
     """
     import matplotlib
 
     folder = run.report.parent / "figures"
     written = []
     with matplotlib.rc_context(STYLE):
-        for name, draw in _drawings(run, dataset, frames[: config.report.frames], matched, least):
+        for name, draw in _drawings(run, dataset, frames[: config.report.frames], matched, least or ScoreThresholds()):
             figure = draw()
             path = folder / f"{name}.{config.report.format}"
             write_bytes(path, saved(figure, config.report.format))
@@ -117,7 +117,7 @@ def saved(figure: Figure, kind: str) -> bytes:
 
 
 def _drawings(
-    run: RunFolder, dataset: Dataset, frames: Sequence[str], matched: MatchedFrames, least: float
+    run: RunFolder, dataset: Dataset, frames: Sequence[str], matched: MatchedFrames, least: ScoreThresholds
 ) -> list[tuple[str, Callable[[], Figure]]]:
     """(file name, function that draws) of every figure this run has data for."""
     drawings: list[tuple[str, Callable[[], Figure]]] = []
@@ -222,14 +222,14 @@ def noise(material: Material) -> Figure:
     return panels.noise_rows(material.frame, material.completed, material.detections or [], WIDTH)
 
 
-def detections(material: Material, least: float) -> Figure:
-    """As Fig. 5.8: the image with boxes, and the cloud from above with true boxes and those of score `least` on."""
+def detections(material: Material, least: ScoreThresholds) -> Figure:
+    """As Fig. 5.8: the image with boxes, the cloud from above with true boxes and those from `least` on."""
     frame = material.frame
     cloud = (
         material.cloud if material.cloud is not None else np.column_stack([frame.points, np.zeros(len(frame.points))])
     )
     labels = frame.labels if frame.has("labels") else []
-    found = [item for item in material.detections or [] if item.score is None or item.score >= least]
+    found = [item for item in material.detections or [] if least.shows(item)]
     return panels.image_over_bev(frame, cloud, labels, found, WIDTH)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from detection.evaluation.bootstrap import Interval, Resampling, confidence_intervals, paired_differences
 from detection.evaluation.difficulty import LEVELS
-from detection.evaluation.explain import FALSE_POSITIVE, MATCHED, MISSED, Explanation, explain
+from detection.evaluation.explain import FALSE_POSITIVE, MISSED, Explanation, explain
 from detection.evaluation.kitti_ap import Evaluation, prepare
 from detection.evaluation.protocol import EVERYWHERE, METRICS, Target
 from detection.kitti_format import KittiObject
@@ -114,22 +114,6 @@ def verdict_text(verdict: Explanation | None) -> str:
     detail = f", {verdict.detail}" if verdict.detail else ""
     status = {"matched": "", "ignored": "not counted: "}.get(verdict.status, f"{verdict.status}: ")
     return f"{status}{verdict.reason}{detail}"
-
-
-def is_wrong(verdict: Explanation | None) -> bool:
-    """True for missed labels and false positives."""
-    return verdict is not None and verdict.status in (MISSED, FALSE_POSITIVE)
-
-
-def counts_of(matched: MatchedFrames, frame: str) -> dict[str, int]:
-    """Found, missed and false positives of a frame."""
-    names = {("label", MATCHED): "found", ("label", MISSED): "missed", ("detection", FALSE_POSITIVE): "false"}
-    totals = dict.fromkeys(names.values(), 0)
-    for (of, side, _), verdict in matched.verdicts.items():
-        name = names.get((side, verdict.status))
-        if of == frame and name:
-            totals[name] += 1
-    return totals
 
 
 # --- tables

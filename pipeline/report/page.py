@@ -1,11 +1,11 @@
-"""report/index.html: one file with everything in it, opened from disk on any machine."""
+"""report/index.html: a file with everything in it, opened from disk on any machine; further pages for more frames."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,8 @@ from pipeline.report.matches import (
 from pipeline.report.views import Display, FrameView, MistakeView, frame_view, mistake_view
 from pipeline.run_folder.config import Config
 from pipeline.run_folder.frame_outputs import FrameOutputs
-from pipeline.run_folder.weights import detection_weights, detector_name
+from pipeline.run_folder.thresholds import ScoreThresholds
+from pipeline.run_folder.weights import detector_name
 from pipeline.scoring.tables import DEPTH_NAMES, ap_header, ap_rows, depth_rows
 
 FOLDER = Path(__file__).resolve().parent
@@ -54,26 +55,63 @@ class Page:
     other: RunFolder | None = None
     differences: list[list[str]] = field(default_factory=list)
     settings: list[tuple[str, str]] = field(default_factory=list)
-    least: float = -math.inf
+    least: ScoreThresholds = field(default_factory=ScoreThresholds)
+    parts: list[Part] = field(default_factory=list)
+    part: Part | None = None
+
+    @property
+    def labelled(self) -> bool:
+        """Whether any frame has labels: without, nothing on the page speaks of true boxes."""
+        return any(view.labelled for view in self.views)
+
+    @property
+    def thresholds(self) -> dict[str, float]:
+        """Class -> score from which it is drawn; "" for all others. Empty when everything is."""
+        drawn = {box.kind: self.least.of(box.kind) for view in self.views for box in (*view.found, *view.other)}
+        return {name: score for name, score in sorted(drawn.items()) if score > -math.inf}
+
+
+@dataclass(frozen=True)
+class Part:
+    """A further page: the frames of the run from `first` on, counted from 0, in the run's order."""
+
+    file: str
+    first: int
+    frames: tuple[str, ...]
+
+    @property
+    def title(self) -> str:
+        """ "000020 to 000039"."""
+        return self.frames[0] if len(self.frames) == 1 else f"{self.frames[0]} to {self.frames[-1]}"
+
+
+def parts_of(frames: tuple[str, ...], count: int, most: int) -> list[Part]:
+    """The pages for a run of more than `count` frames, at most `most`; none where one page holds them all."""
+    if len(frames) <= count:
+        return []
+    starts = range(0, len(frames), count)[:most]
+    return [Part(f"frames-{n}.html", start, frames[start : start + count]) for n, start in enumerate(starts, start=1)]
 
 
 def write_report(config: Config, run: RunFolder, dataset: Dataset, frames: tuple[str, ...]) -> Path:
     """Writes the report of a run, and the figures or recordings that `report.format` asks for; returns its path.
 
-    At most `report.frames` frames are shown: those with the worst mistakes and others spread evenly over the run.
+    The page shows at most `report.frames` frames: those with the worst mistakes and others spread evenly over the run.
+    Further pages, at most `report.pages`, show all frames in order.
     Raises UsageError when the run to compare with is not there.
     """
     other = other_run(config)
     matched = judge(config, run, dataset, frames)
     matched_other = judge(config, other, dataset, frames) if other is not None else MatchedFrames()
     found = mistakes(matched)
-    least = score_threshold(config)
+    least = ScoreThresholds.of_run(config)
     shown = chosen_frames(frames, found, config.report.frames)
+    parts = parts_of(frames, config.report.frames, config.report.pages)
     display = Display(hover_step(len(shown)), point_budget(len(shown)), matched, other, matched_other, least)
     page = Page(
         views=[frame_view(dataset[frame_id], FrameOutputs(run, frame_id), display) for frame_id in shown],
         total=len(frames),
-        worst=worst_views(found, dataset, shown),
+        worst=worst_views(found, dataset, shown, parts),
         n_mistakes=len(found),
         ap=ap_cells(matched),
         curves=curve_panels(matched),
@@ -81,14 +119,31 @@ def write_report(config: Config, run: RunFolder, dataset: Dataset, frames: tuple
         differences=difference_rows(matched, matched_other),
         settings=settings_of(config),
         least=least,
+        parts=parts,
     )
     write_text(run.report, render(run, page))
+    write_parts(run, dataset, page, display)
     write_beside(config, run, dataset, frames, matched, least)
     return run.report
 
 
+def write_parts(run: RunFolder, dataset: Dataset, page: Page, display: Display) -> None:
+    """Writes the further pages, and removes those of an earlier report that had more."""
+    folder = run.report.parent
+    for old in set(folder.glob("frames-*.html")) - {folder / part.file for part in page.parts}:
+        old.unlink()
+    for part in page.parts:
+        views = [frame_view(dataset[frame_id], FrameOutputs(run, frame_id), display) for frame_id in part.frames]
+        write_text(folder / part.file, render(run, replace(page, views=views, part=part)))
+
+
 def write_beside(
-    config: Config, run: RunFolder, dataset: Dataset, frames: tuple[str, ...], matched: MatchedFrames, least: float
+    config: Config,
+    run: RunFolder,
+    dataset: Dataset,
+    frames: tuple[str, ...],
+    matched: MatchedFrames,
+    least: ScoreThresholds,
 ) -> list[Path]:
     """What `report.format` asks for beside the page: figures, or a recording of all frames for a viewer."""
     kind = config.report.format
@@ -104,7 +159,7 @@ def write_beside(
 
     write = write_rrd if kind == "rrd" else write_mcap
     path = run.report.parent / f"{run.root.name}.{kind}"
-    return [write(path, scenes(run, dataset, frames), run.root.name)]
+    return [write(path, scenes(run, dataset, frames, least), run.root.name)]
 
 
 def settings_of(config: Config) -> list[tuple[str, str]]:
@@ -119,16 +174,6 @@ def settings_of(config: Config) -> list[tuple[str, str]]:
         ("seed", str(config.seed)),
         ("AugLiDAR", " ".join(filter(None, (made.get("auglidar"), made.get("git"))))),
     ]
-
-
-def score_threshold(config: Config) -> float:
-    """The score from which the detector's card takes a box to be meant; -inf where there is no card to say so."""
-    try:
-        card = detection_weights(detector_name(config))[-1]
-    except UsageError:
-        return -math.inf
-    least = _read_json(card).get("score_threshold")
-    return float(least) if isinstance(least, (int, float)) else -math.inf
 
 
 def _detector(config: Config) -> str:
@@ -165,13 +210,20 @@ def spread(frames: tuple[str, ...], count: int) -> tuple[str, ...]:
     return tuple(frames[index] for index in np.linspace(0, len(frames) - 1, count).round().astype(int))
 
 
-def worst_views(found: Sequence[Mistake], dataset: Dataset, shown: Sequence[str]) -> list[MistakeView]:
+def worst_views(
+    found: Sequence[Mistake], dataset: Dataset, shown: Sequence[str], parts: Sequence[Part] = ()
+) -> list[MistakeView]:
     """The worst misses and the worst false positives, half each where there are enough of both."""
     half = LISTED_MISTAKES // 2
     missed = [mistake for mistake in found if mistake.kind == "missed"]
     false = [mistake for mistake in found if mistake.kind == "false"]
     listed = missed[: max(half, LISTED_MISTAKES - len(false))] + false[: max(half, LISTED_MISTAKES - len(missed))]
-    places = {frame_id: f"frame-{number}" for number, frame_id in enumerate(shown, start=1)}
+    places = {
+        frame_id: f"{part.file}#frame-{number}"
+        for part in parts
+        for number, frame_id in enumerate(part.frames, start=1)
+    }
+    places |= {frame_id: f"#frame-{number}" for number, frame_id in enumerate(shown, start=1)}
     return [mistake_view(mistake, dataset[mistake.frame], places.get(mistake.frame, "")) for mistake in listed]
 
 
@@ -192,6 +244,7 @@ def render(run: RunFolder, page: Page) -> str:
         page=page,
         views=page.views,
         total=page.total,
+        shown_all=sum(len(part.frames) for part in page.parts) == page.total,
         palettes=palettes(),
         facts=headline(metrics, page.total),
         ap_header=ap_header(metrics),
@@ -253,7 +306,7 @@ def legends(used: set[str]) -> dict[str, dict[str, Any]]:
     scales = {
         "depth": ("Depth, m", pictures.depth_colours(), depth),
         "sigma": ("Sigma", pictures.sigma_colours(), sigma),
-        "error": ("Error, m", pictures.error_colours(), error),
+        "error": ("Error, gap, m", pictures.error_colours(), error),
     }
     return {
         name: {"title": title, "gradient": pictures.gradient(colours), "ticks": ticks}

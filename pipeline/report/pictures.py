@@ -18,6 +18,8 @@ DEPTH_TICKS = (2, 5, 10, 20, 40, 80)
 LARGEST_ERROR = 5.0
 ERROR_TICKS = (0.0, 0.2, 1.0, 2.5, 5.0)
 NO_VALUE = np.array([24, 28, 34], np.uint8)
+# Surfaces less than this apart (metres) are one surface to the eye; their sigma is drawn in this grey.
+APART, UNDECIDED = 0.5, np.array([70, 76, 84], np.uint8)
 
 # Bird's-eye view, metres: forward from the sensor and to both sides.
 FORWARD, SIDE = 80.0, 40.0
@@ -65,6 +67,39 @@ def colour_sigma(sigma: NDArray[np.float32], valid: NDArray[np.bool_]) -> RGB:
     picture = sigma_colours()[(sigma.clip(0, 1) * 255).round().astype(np.uint8)]
     picture[~valid] = NO_VALUE
     return np.asarray(picture, dtype=np.uint8)
+
+
+def widened(depth: NDArray[np.float32], nearest: bool) -> NDArray[np.float32]:
+    """(H, W) metres, each pixel the nearest (or the farthest) value of its 5 x 5 neighbourhood; 0 = no value."""
+    import cv2
+
+    kernel = np.ones((5, 5), np.uint8)
+    if not nearest:
+        return np.asarray(cv2.dilate(depth, kernel), dtype=np.float32)
+    inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
+    grown = cv2.dilate(inverse, kernel)
+    return np.divide(1, grown, out=np.zeros_like(grown), where=grown > 0).astype(np.float32)
+
+
+def colour_gap(gap: NDArray[np.float32], valid: NDArray[np.bool_]) -> RGB:
+    """(H, W) metres between two surfaces -> RGB on the scale of errors, the largest of every 5 x 5 pixels."""
+    share = np.sqrt(widened(gap, nearest=False) / LARGEST_ERROR).clip(0, 1)
+    picture = error_colours()[(share * 255).astype(np.uint8)]
+    picture[~valid] = NO_VALUE
+    return np.asarray(picture, dtype=np.uint8)
+
+
+def colour_sigma_between(sigma: NDArray[np.float32], gap: NDArray[np.float32], valid: NDArray[np.bool_]) -> RGB:
+    """Sigma where the surfaces lie `APART` metres or more apart, drawn wide on grey; elsewhere it decides nothing."""
+    import cv2
+
+    kernel = np.ones((5, 5), np.uint8)
+    apart = ((gap >= APART) & valid).astype(np.float32)
+    weight = cv2.blur(apart, (5, 5))
+    mean = np.divide(cv2.blur(sigma * apart, (5, 5)), weight, out=np.zeros_like(sigma), where=weight > 0)
+    picture = colour_sigma(mean, valid)
+    picture[valid & (cv2.dilate(apart, kernel) == 0)] = UNDECIDED
+    return picture
 
 
 def error_colours() -> RGB:

@@ -3,21 +3,39 @@
   const byId = (id) => document.getElementById(id);
   for (const kind of ["truth", "found"]) {
     const box = byId(`show-${kind}`);
+    if (!box) continue;
     const apply = () => { document.body.classList.toggle(`no-${kind}`, !box.checked); AugCloud.redraw(); };
     box.addEventListener("change", apply);
     apply();
   }
 
-  // Scores are raw values of any scale: the slider runs over their ranks.
-  const found = [...document.querySelectorAll(".box.found, .box.other")];
-  const scores = found.map((path) => Number(path.dataset.score)).sort((a, b) => a - b);
-  // They start at the threshold of the detector's card. A label whose detection is not shown counts as missed.
-  const slider = byId("score"), threshold = slider.dataset.least === undefined ? -Infinity : Number(slider.dataset.least);
+  // Scores are raw values of any scale, and every class has its own: the slider runs over the ranks within each class.
+  // All classes start together at the thresholds of the detector's card, in the middle of the slider (without a card at
+  // its left end, where everything is shown), and move together from there.
+  const found = [...document.querySelectorAll(":is(.box, .name):is(.found, .other)")];
+  const scores = {};
+  for (const path of found) if (path.matches(".box")) (scores[path.dataset.class] ||= []).push(Number(path.dataset.score));
+  for (const values of Object.values(scores)) values.sort((a, b) => a - b);
+  const classes = Object.keys(scores).sort();
+  const slider = byId("score"), thresholds = JSON.parse(slider.dataset.least || "{}");
+  const start = slider.dataset.least ? 50 : 0;
+  const leastOf = (name, place) => {
+    const values = scores[name], threshold = name in thresholds ? thresholds[name] : -Infinity;
+    if (place <= 0) return -Infinity;
+    if (place === start) return threshold;
+    const below = start ? values.filter((score) => score < threshold).length / values.length : 0;
+    const share = place < start ? (below * place) / start : below + ((1 - below) * (place - start)) / (100 - start);
+    return share >= 1 ? Infinity : values[Math.floor(share * values.length)];
+  };
+  // A label whose detection is not shown counts as missed.
   const labels = [...document.querySelectorAll(".box.truth[data-met]")];
-  const applyScore = (least) => {
-    byId("score-text").textContent = least === -Infinity ? "all" : least.toFixed(2);
-    for (const path of found) path.classList.toggle("low", Number(path.dataset.score) < least);
-    for (const path of labels) path.toggleAttribute("data-wrong", Number(path.dataset.met) < least);
+  const applyScore = (place) => {
+    slider.value = place;
+    const least = Object.fromEntries(classes.map((name) => [name, leastOf(name, Number(slider.value))]));
+    const words = Object.entries(least).filter(([, score]) => Number.isFinite(score)).map(([name, score]) => `${name} ${score.toFixed(2)}`);
+    byId("score-text").textContent = Number(slider.value) <= 0 ? "all" : words.join(", ") || "none";
+    for (const path of found) path.classList.toggle("low", Number(path.dataset.score) < least[path.dataset.class]);
+    for (const path of labels) path.toggleAttribute("data-wrong", Number(path.dataset.met) < (least[path.dataset.class] ?? -Infinity));
     for (const frame of document.querySelectorAll("article")) tally(frame);
     AugCloud.least = least;
     AugCloud.redraw();
@@ -26,20 +44,23 @@
     const view = frame.querySelector("svg.bev") || frame.querySelector("svg.photo"), text = frame.querySelector(".tally");
     if (!view || !text) return;
     const count = (kind) => view.querySelectorAll(`.box.${kind}`).length, shown = "found:not(.low)";
-    const judged = view.querySelector("[data-met], [data-wrong]");
-    text.textContent = `${count("truth")} true, ${count(shown)} predicted` + (judged
-      ? `: ${count("truth[data-met]:not([data-wrong])")} found, ${count("truth[data-wrong]")} missed, ${count(`${shown}[data-wrong]`)} false` : "");
+    const counts = (total, what, kinds) => {
+      const entries = Object.entries(kinds), rest = total - entries.reduce((sum, [, n]) => sum + n, 0);
+      if (rest === total) return `${total} ${what}`;
+      return `${total} ${what}: ${entries.map(([name, n]) => `${n} ${name}`).join(", ")}${rest ? `, ${rest} not counted` : ""}`;
+    };
+    const parts = [];
+    if (frame.dataset.labelled) {
+      parts.push(counts(count("truth"), "true", { found: count("truth[data-met]:not([data-wrong])"), missed: count("truth[data-wrong]") }));
+    }
+    if (/predicted/.test(text.textContent)) {
+      parts.push(counts(count(shown), "predicted", { right: count(`${shown}[data-right]`), false: count(`${shown}[data-wrong]`) }));
+    }
+    text.textContent = parts.join("; ");
   };
-  const slide = (value) => {
-    slider.value = value;
-    const share = Number(slider.value) / 100;
-    applyScore(share === 0 || !scores.length ? -Infinity : scores[Math.min(scores.length - 1, Math.floor(share * scores.length))]);
-  };
-  const toThreshold = () => {
-    slider.value = scores.length ? (100 * scores.filter((score) => score < threshold).length) / scores.length : 0;
-    applyScore(threshold);
-  };
-  slider.addEventListener("input", () => slide(slider.value));
+  const slide = (place) => applyScore(Math.min(100, Math.max(0, place)));
+  const toThreshold = () => slide(start);
+  slider.addEventListener("input", () => slide(Number(slider.value)));
   toThreshold();
 
   // Frames: J and K (or N and P) go forward and back, the list jumps.
@@ -63,10 +84,10 @@
     const step = { j: 1, n: 1, k: -1, p: -1 }[event.key];
     if (step) show(current() + step);
     const boxes = { 1: "truth", 2: "found" }[event.key];
-    if (boxes) byId(`show-${boxes}`).click();
+    if (boxes && byId(`show-${boxes}`)) byId(`show-${boxes}`).click();
     const change = { "[": -5, "]": 5 }[event.key];
     if (change) slide(Number(slider.value) + change);
-    if (event.key === "0") { if (AugCloud.least === -Infinity) toThreshold(); else slide(0); }
+    if (event.key === "0") { if (Number(slider.value) === 0) toThreshold(); else slide(0); }
     if (event.key === "?") help();
   });
   const help = () => {

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from detection.evaluation.explain import MATCHED
 from pipeline.base.errors import DataError
 from pipeline.base.paths import RunFolder
 from pipeline.data import Frame
@@ -17,8 +17,9 @@ from pipeline.report import pictures
 from pipeline.report.boxes import DrawnBox, drawn_boxes
 from pipeline.report.cloud import cloud_of_frame, still_picture
 from pipeline.report.hover import HoverGrid, hover_grid
-from pipeline.report.matches import MatchedFrames, Mistake, counts_of
+from pipeline.report.matches import MatchedFrames, Mistake
 from pipeline.run_folder.frame_outputs import FrameOutputs
+from pipeline.run_folder.thresholds import ScoreThresholds
 
 PHOTO_WIDTH, MAP_WIDTH = 1242, 620
 THUMB_WIDTH, THUMB_HEIGHT = 240, 140
@@ -43,7 +44,7 @@ class Display:
     points  most points of one cloud
     matched  what became of labels and detections
     other   a second run to compare with, and its objects
-    least   score from which predicted boxes are drawn at first
+    least   scores from which predicted boxes are drawn at first
     """
 
     step: int
@@ -51,7 +52,7 @@ class Display:
     matched: MatchedFrames = field(default_factory=MatchedFrames)
     other: RunFolder | None = None
     other_matched: MatchedFrames = field(default_factory=MatchedFrames)
-    least: float = -math.inf
+    least: ScoreThresholds = field(default_factory=ScoreThresholds)
 
 
 @dataclass
@@ -70,7 +71,8 @@ class FrameView:
     other: list[DrawnBox] = field(default_factory=list)
     steps: list[dict[str, Any]] = field(default_factory=list)
     other_steps: list[dict[str, Any]] = field(default_factory=list)
-    counts: dict[str, int] = field(default_factory=dict)
+    tally: str = ""
+    labelled: bool = False
     points: int = 0
     cloud: dict[str, Any] | None = None
     still: str = ""
@@ -105,14 +107,12 @@ def _add_maps(frame: Frame, files: FrameOutputs, display: Display, view: FrameVi
         return
     completed = files.read_completed()
     depth_maps = [("sparse depth, the input", frame.sparse_depth), ("completed depth", completed.depth)]
-    if completed.foreground is not None and completed.background is not None:
-        depth_maps += [("foreground surface", completed.foreground), ("background surface", completed.background)]
     if frame.has("target_depth"):
         depth_maps.append(("true depth", frame.target_depth))
     for caption, depth in depth_maps:
         view.maps.append(depth_map(caption, depth, display.step))
-    if completed.sigma is not None:
-        view.maps.append(sigma_map(completed.sigma, completed.depth > 0, display.step))
+    if completed.foreground is not None and completed.background is not None and completed.sigma is not None:
+        view.maps += surface_maps(completed.foreground, completed.background, completed.sigma, display.step)
     if frame.has("target_depth"):
         view.maps.append(error_map("error of the completed depth", completed.depth, frame.target_depth, display.step))
 
@@ -125,10 +125,32 @@ def depth_map(caption: str, depth: NDArray[np.float32], step: int) -> MapPicture
     return MapPicture(caption, pictures.data_uri(picture, MAP_WIDTH, 74), "depth", grid)
 
 
-def sigma_map(sigma: NDArray[np.float32], valid: NDArray[np.bool_], step: int) -> MapPicture:
-    """Weight of the foreground."""
-    uri = pictures.data_uri(pictures.colour_sigma(sigma, valid), MAP_WIDTH, 74)
-    return MapPicture("sigma, weight of the foreground", uri, "sigma", hover_grid(sigma, valid, step, SIGMA_SCALE, ""))
+def surface_maps(
+    foreground: NDArray[np.float32], background: NDArray[np.float32], sigma: NDArray[np.float32], step: int
+) -> list[MapPicture]:
+    """The two surfaces, how far they lie apart, and sigma where it chooses between them.
+
+    They differ along outlines, which vanish when the maps are shrunk: the foreground keeps the nearest value of every
+    few pixels, the background the farthest, and the other two maps are drawn a few pixels wide.
+    """
+    valid = (foreground > 0) & (background > 0)
+    gap = np.where(valid, np.maximum(background - foreground, 0), 0).astype(np.float32)
+    pairs = (
+        ("foreground surface, the nearer", foreground, True),
+        ("background surface, the farther", background, False),
+    )
+    maps = []
+    for caption, surface, nearest in pairs:
+        picture = pictures.colour_depth(pictures.widened(surface, nearest))
+        grid = hover_grid(surface, valid, step, DEPTH_SCALE, "m")
+        maps.append(MapPicture(caption, pictures.data_uri(picture, MAP_WIDTH, 74), "depth", grid))
+    apart = pictures.colour_gap(gap, valid)
+    grid = hover_grid(gap, valid, step, DEPTH_SCALE, "m")
+    maps.append(MapPicture("between the surfaces", pictures.data_uri(apart, MAP_WIDTH, 74), "error", grid))
+    chosen = pictures.colour_sigma_between(sigma, gap, valid)
+    grid = hover_grid(sigma, valid, step, SIGMA_SCALE, "")
+    maps.append(MapPicture("sigma, where they differ", pictures.data_uri(chosen, MAP_WIDTH, 74), "sigma", grid))
+    return maps
 
 
 def error_map(caption: str, depth: NDArray[np.float32], target: NDArray[np.float32], step: int) -> MapPicture:
@@ -148,7 +170,35 @@ def _add_boxes(frame: Frame, files: FrameOutputs, display: Display, view: FrameV
         view.truth = drawn_boxes(frame.labels, frame.calibration, frame.image_size, verdicts_of("label"), found or ())
     if found is not None:
         view.found = drawn_boxes(found, frame.calibration, frame.image_size, verdicts_of("detection"))
-        view.counts = counts_of(display.matched, frame.id) if frame.id in display.matched.labels else {}
+    view.labelled = frame.has("labels")
+    shown = None if found is None else view.found
+    view.tally = tally(view.truth if view.labelled else None, shown, display.least)
+
+
+def tally(truth: Sequence[DrawnBox] | None, found: Sequence[DrawnBox] | None, least: ScoreThresholds) -> str:
+    """Counts of a frame's boxes that add up: "6 true: 1 found, 4 missed, 1 not counted; 2 predicted: 1 right, 1 false".
+
+    None where there are no labels, or no detections. A label whose detection is not shown counts as missed.
+    """
+    shown = [box for box in found or () if box.score is None or box.score >= least.of(box.kind)]
+    parts = []
+    if truth is not None:
+        met = sum(box.met is not None and box.met >= least.of(box.kind) for box in truth)
+        missed = sum(box.wrong or (box.met is not None and box.met < least.of(box.kind)) for box in truth)
+        parts.append(_counts(len(truth), "true", {"found": met, "missed": missed}))
+    if found is not None:
+        right = sum(box.status == MATCHED for box in shown)
+        parts.append(_counts(len(shown), "predicted", {"right": right, "false": sum(box.wrong for box in shown)}))
+    return "; ".join(parts)
+
+
+def _counts(total: int, what: str, kinds: dict[str, int]) -> str:
+    """ "3 true: 1 found, 1 missed, 1 not counted"; the total alone where nothing was compared."""
+    if not any(kinds.values()):
+        return f"{total} {what}"
+    rest = total - sum(kinds.values())
+    words = [f"{count} {name}" for name, count in kinds.items()] + ([f"{rest} not counted"] if rest else [])
+    return f"{total} {what}: {', '.join(words)}"
 
 
 def _add_cloud(frame: Frame, files: FrameOutputs, display: Display, view: FrameView) -> None:
@@ -161,14 +211,21 @@ def _add_cloud(frame: Frame, files: FrameOutputs, display: Display, view: FrameV
     view.birds_eye = pictures.data_uri(pictures.birds_eye_picture(cloud.points, cloud.measured), 10_000, quality=101)
     shown = cloud.thinned(display.points, seed=0)
     view.cloud = shown.packed() | {"boxes": _boxes_3d(view)}
-    sure = [box for box in view.found if box.score is None or box.score >= display.least]
+    sure = [box for box in view.found if box.score is None or box.score >= display.least.of(box.kind)]
     solid = [("truth", box.corners) for box in view.truth] + [("found", box.corners) for box in sure]
     view.still = pictures.data_uri(still_picture(cloud.thinned(8000, seed=0), solid), 10_000, quality=60)
 
 
 def _boxes_3d(view: FrameView) -> list[dict[str, Any]]:
     return [
-        {"kind": kind, "corners": box.corners.round(2).tolist(), "score": box.score, "wrong": box.wrong, "met": box.met}
+        {
+            "kind": kind,
+            "class": box.kind,
+            "corners": box.corners.round(2).tolist(),
+            "score": box.score,
+            "wrong": box.wrong,
+            "met": box.met,
+        }
         for kind in ("truth", "found")
         for box in getattr(view, kind)
     ]

@@ -97,7 +97,8 @@ def _protocol(value: object) -> EvaluationProtocol:
 class ReportConfig(Section):
     """The HTML report."""
 
-    frames: int = Field(default=20, ge=1, le=500, description="frames shown in detail")
+    frames: int = Field(default=20, ge=1, le=500, description="frames shown in detail on one page")
+    pages: int = Field(default=10, ge=0, le=1000, description="further pages for a run of more frames; all, in order")
     compare: str | None = Field(default=None, description="folder of another run over the same frames")
     format: Literal["html", "png", "pdf", "svg", "rrd", "mcap"] = Field(
         default="html", description="further output beside the page: figures, or recordings for Rerun and Foxglove"

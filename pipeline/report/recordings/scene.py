@@ -15,11 +15,15 @@ from pipeline.data import Dataset, Frame
 from pipeline.report import pictures
 from pipeline.report.boxes import DRAWN
 from pipeline.run_folder.frame_outputs import FrameOutputs
+from pipeline.run_folder.thresholds import ScoreThresholds
 from pipeline.stages.clouds import lidar_of
 
 # Seconds between two frames in a recording: KITTI's 10 Hz.
 PERIOD = 0.1
 BOX_COLOURS = {"truth": (43, 212, 164), "found": (255, 122, 26)}
+
+
+ALL_SCORES = ScoreThresholds()
 
 
 @dataclass(frozen=True)
@@ -59,13 +63,18 @@ class Scene:
     boxes: dict[str, list[SceneBox]] = field(default_factory=dict)
 
 
-def scenes(run: RunFolder, dataset: Dataset, frames: Sequence[str]) -> Iterator[Scene]:
-    """The frames of a run, one at a time; what a frame does not have is empty. Raises DataError for damaged files."""
+def scenes(
+    run: RunFolder, dataset: Dataset, frames: Sequence[str], least: ScoreThresholds = ALL_SCORES
+) -> Iterator[Scene]:
+    """The frames of a run, one at a time; what a frame does not have is empty. Raises DataError for damaged files.
+
+    least  scores from which predicted boxes are recorded
+    """
     for index, frame_id in enumerate(frames):
-        yield scene_of(run, dataset[frame_id], index * PERIOD)
+        yield scene_of(run, dataset[frame_id], index * PERIOD, least)
 
 
-def scene_of(run: RunFolder, frame: Frame, time: float) -> Scene:
+def scene_of(run: RunFolder, frame: Frame, time: float, least: ScoreThresholds = ALL_SCORES) -> Scene:
     """One frame at `time` seconds from the start of the recording."""
     files = FrameOutputs(run, frame.id)
     if run.cloud(frame.id).is_file():
@@ -84,7 +93,7 @@ def scene_of(run: RunFolder, frame: Frame, time: float) -> Scene:
             images["sigma"] = pictures.colour_sigma(completed.sigma, completed.depth > 0)
     boxes = {"truth": scene_boxes(frame, frame.labels if frame.has("labels") else [])}
     if run.detections(frame.id).is_file():
-        boxes["found"] = scene_boxes(frame, files.read_detections())
+        boxes["found"] = scene_boxes(frame, [item for item in files.read_detections() if least.shows(item)])
     return Scene(frame.id, time, cloud, colours[(cloud[:, 4] > 0).astype(int)], images, boxes)
 
 

@@ -17,7 +17,6 @@ from pipeline.report.matches import (
     MatchedFrames,
     Mistake,
     ap_cells,
-    counts_of,
     curve_panels,
     difference_rows,
     mistakes,
@@ -58,8 +57,6 @@ def test_mistakes_come_worst_first_with_their_reason(example: MatchedFrames) -> 
     ]
     assert found[0].reason == "no detection overlaps"
     assert found[2].reason == "nothing there"
-    assert counts_of(example, "a") == {"found": 1, "missed": 1, "false": 1}
-    assert counts_of(example, "b") == {"found": 0, "missed": 1, "false": 1}
 
 
 def test_verdicts_name_the_place_in_the_list(example: MatchedFrames) -> None:
