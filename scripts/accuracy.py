@@ -83,7 +83,9 @@ def car_row(real: dict[str, Any], detector: str, rows: int) -> dict[str, Any] | 
     """Cars found from above at IoU 0.5, if that was measured."""
     for row in real.get("detection", []):
         if (row["detector"], row["rows"]) == (detector, rows):
-            return next(item for item in row["reports"] if (item["metric"], item["iou"]) == ("bev", 0.5))
+            return next(
+                item for item in row["reports"] if (item["class"], item["metric"], item["iou"]) == ("Car", "bev", 0.5)
+            )
     return None
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from auglidar_base.atomic import write_text
 from pipeline.base.errors import UsageError
 from pipeline.data import open_dataset
-from pipeline.pretrained.figures import AT_THRESHOLD, HeldOut
+from pipeline.pretrained.figures import HeldOut, thresholds
 from pipeline.run_folder.weights import bundled_folder
 
 ROOMS = {"completion": "completion", "detection": "detection", "segmentation": "pipeline/semantics"}
@@ -48,7 +48,7 @@ def measured(room: str, weights: Path, held_out: HeldOut) -> dict[str, Any]:
     figures = held_out.figures(room, weights)
     if room != "detection":
         return {"held_out": figures}
-    return {"held_out": figures, "cloud": held_out.cloud, "score_threshold": figures[AT_THRESHOLD]["threshold"]}
+    return {"held_out": figures, "cloud": held_out.cloud, "score_thresholds": thresholds(figures)}
 
 
 def write_card(weights: Path, card: dict[str, Any]) -> None:
@@ -74,11 +74,16 @@ def parser_of(program: str, text: str | None) -> argparse.ArgumentParser:
     parser.add_argument("room", choices=tuple(ROOMS))
     parser.add_argument("run", type=Path, help="folder of the training run")
     parser.add_argument("name", help="name of the bundled weights")
+    add_held_out(parser)
+    return parser
+
+
+def add_held_out(parser: argparse.ArgumentParser) -> None:
+    """The frames to measure on, and for detectors the clouds they are given."""
     parser.add_argument("--data", required=True, help="held-out synthetic data set in KITTI object layout")
     parser.add_argument("--frames", default="0:", help="frames of it (default: all)")
     parser.add_argument("--cloud", default="L", help="detection: preset of the clouds it was trained on")
     parser.add_argument("--completer", default="classical", help="detection: completion for augmented clouds")
-    return parser
 
 
 def held_out_of(args: argparse.Namespace) -> HeldOut:

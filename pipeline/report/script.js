@@ -25,7 +25,7 @@
     if (place === start) return threshold;
     const below = start ? values.filter((score) => score < threshold).length / values.length : 0;
     const share = place < start ? (below * place) / start : below + ((1 - below) * (place - start)) / (100 - start);
-    return share >= 1 ? Infinity : values[Math.floor(share * values.length)];
+    return values[Math.min(values.length - 1, Math.floor(share * values.length))];
   };
   // A label whose detection is not shown counts as missed.
   const labels = [...document.querySelectorAll(".box.truth[data-met]")];
@@ -33,7 +33,7 @@
     slider.value = place;
     const least = Object.fromEntries(classes.map((name) => [name, leastOf(name, Number(slider.value))]));
     const words = Object.entries(least).filter(([, score]) => Number.isFinite(score)).map(([name, score]) => `${name} ${score.toFixed(2)}`);
-    byId("score-text").textContent = Number(slider.value) <= 0 ? "all" : words.join(", ") || "none";
+    byId("score-text").textContent = Number(slider.value) <= 0 ? "all" : words.join(", ") || "all";
     for (const path of found) path.classList.toggle("low", Number(path.dataset.score) < least[path.dataset.class]);
     for (const path of labels) path.toggleAttribute("data-wrong", Number(path.dataset.met) < (least[path.dataset.class] ?? -Infinity));
     for (const frame of document.querySelectorAll("article")) tally(frame);

@@ -106,15 +106,15 @@ def _add_maps(frame: Frame, files: FrameOutputs, display: Display, view: FrameVi
     if not files.run.depth(frame.id).is_file():
         return
     completed = files.read_completed()
-    depth_maps = [("sparse depth, the input", frame.sparse_depth), ("completed depth", completed.depth)]
-    if frame.has("target_depth"):
-        depth_maps.append(("true depth", frame.target_depth))
-    for caption, depth in depth_maps:
-        view.maps.append(depth_map(caption, depth, display.step))
+    view.maps = [
+        depth_map("sparse depth, the input", frame.sparse_depth, display.step),
+        depth_map("completed depth", completed.depth, display.step),
+    ]
     if completed.foreground is not None and completed.background is not None and completed.sigma is not None:
         view.maps += surface_maps(completed.foreground, completed.background, completed.sigma, display.step)
     if frame.has("target_depth"):
-        view.maps.append(error_map("error of the completed depth", completed.depth, frame.target_depth, display.step))
+        error = error_map("error of the completed depth", completed.depth, frame.target_depth, display.step)
+        view.maps += [depth_map("true depth", frame.target_depth, display.step), error]
 
 
 def depth_map(caption: str, depth: NDArray[np.float32], step: int) -> MapPicture:

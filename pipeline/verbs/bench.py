@@ -26,7 +26,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     parser.epilog = EXAMPLES
     add = parser.add_argument
-    add("--suite", choices=("real",), default="real", help="real: held-out LiDAR rings, cars and masks on KITTI frames")
+    add(
+        "--suite",
+        choices=("real",),
+        default="real",
+        help="real: held-out LiDAR rings, objects and masks on KITTI frames",
+    )
     add("--data", required=True, metavar="DIR", help="KITTI object folder (training/velodyne, image_2, calib, label_2)")
     add("--frames", metavar="FILE|a:b|ids", help="split file, positions, or ids separated by commas")
     add("--rows", default="32,16,8", metavar="N,N", help="LiDAR rows given to completion (default: 32,16,8)")
@@ -38,7 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="network,boxes",
         help="mask sources (default: network,boxes); '' for none",
     )
-    add("--threshold", type=float, metavar="S", help="lowest score that counts (default: the one in the card)")
+    add(
+        "--threshold",
+        type=float,
+        metavar="S",
+        help="lowest score that counts (default: each class' own, from the card)",
+    )
     add("--out", metavar="DIR", help="also write real.json and real.md there")
     add("--json", action="store_true", help="print JSON instead of tables")
 
@@ -66,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     masks = {name: open_semantics(name) for name in args.masks.split(",") if name}
     labelled = all(dataset[frame_id].has("labels") for frame_id in dataset.ids)
     if not labelled:
-        progress("not every frame has labels: cars and masks are not measured")
+        progress("not every frame has labels: objects and masks are not measured")
     found: dict[str, Any] = {"frames": len(dataset), "completion": completion_scores(dataset, names, rows, progress)}
     if detectors and labelled:
         best = [name for name in names if name not in WITHOUT_WEIGHTS] or ["classical"]
@@ -102,6 +112,7 @@ def _detection_rows(chosen: str | None, threshold: float | None) -> list[Any]:
     """Every detector on the clouds it was trained for, at 64 and at 16 rows."""
     from detection.checkpoints import find_weights, read_card
     from pipeline.benchmark.suite import DetectionRow
+    from pipeline.run_folder.thresholds import ScoreThresholds
     from pipeline.run_folder.weights import bundled_names
 
     names = bundled_names("detection") if chosen is None else [name for name in chosen.split(",") if name]
@@ -109,8 +120,8 @@ def _detection_rows(chosen: str | None, threshold: float | None) -> list[Any]:
     for name in names:
         card = read_card(find_weights(name))
         preset = str(card.get("cloud", "L"))
-        score = float(card.get("score_threshold", 0.0)) if threshold is None else threshold
-        rows += [DetectionRow(name, preset, number, score) for number in (64, 16)]
+        least = ScoreThresholds.of_card(card) if threshold is None else ScoreThresholds({}, threshold)
+        rows += [DetectionRow(name, preset, number, least) for number in (64, 16)]
     return rows
 
 
@@ -133,13 +144,14 @@ def _completion_table(found: dict[str, Any]) -> list[str]:
 
 
 def _detection_table(found: dict[str, Any]) -> list[str]:
-    lines = [f"Cars found, {found['frames']} frames (found/labelled; precision)", ""]
-    lines += ["| detector | cloud | rows | overlap | easy | moderate | hard | precision | false |", "|" + "---|" * 9]
+    lines = [f"Objects found, {found['frames']} frames (found/labelled; precision)", ""]
+    lines += ["| detector | cloud | rows | class | overlap | easy | moderate | hard | precision | false |"]
+    lines += ["|" + "---|" * 10]
     for entry in found["detection"]:
         for report in entry["reports"]:
             counts = [f"{hit}/{total}" for hit, total in report["found"].values()]
             lines.append(
-                f"| {entry['detector']} | {entry['preset']} | {entry['rows']} | "
+                f"| {entry['detector']} | {entry['preset']} | {entry['rows']} | {report['class']} | "
                 f"{report['metric']} {report['iou']:g} | "
                 + " | ".join(counts)
                 + f" | {_number(report['precision'], 2)} | {report['false']} |"

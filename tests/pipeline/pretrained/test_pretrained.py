@@ -14,7 +14,7 @@ from pipeline.data import open_dataset
 from pipeline.pretrained import again, cards
 from pipeline.pretrained.__main__ import main as embed
 from pipeline.pretrained.cards import ROOMS, without_places
-from pipeline.pretrained.figures import AT_THRESHOLD, HeldOut, operating_point, segmentation_figures
+from pipeline.pretrained.figures import HeldOut, at_threshold, operating_point, segmentation_figures
 from pipeline.run_folder.config import load_config
 from pipeline.run_folder.weights import bundled_folder
 from pipeline.semantics.conventions import NONE
@@ -109,8 +109,10 @@ def test_a_run_is_embedded_and_measured_again(room: str, tmp_path: Path, package
     assert card["data"] == ["800 frames of the synthetic world, seed 1001"]
     assert card["command"] == [f"run_pipeline --config {path} --stage train" for path in MADE[1:3]]
     if room == "detection":
-        assert card["score_threshold"] == card["held_out"][AT_THRESHOLD]["threshold"]
-        assert {"ap_r40", "ap_r40, 16 rows", f"{AT_THRESHOLD}, 16 rows"} < set(card["held_out"])
+        assert card["score_thresholds"] == {
+            name: card["held_out"][at_threshold(name)]["threshold"] for name in ("Car", "Pedestrian", "Cyclist")
+        }
+        assert {"ap_r40", "ap_r40, 16 rows", "car, BEV IoU 0.7, hard, 16 rows"} < set(card["held_out"])
     for _ in range(2):
         again.main([room, str(run), "mine", "--data", str(streets)])
     noted = json.loads(weights.with_suffix(".json").read_text())
@@ -167,3 +169,5 @@ def test_the_operating_point_is_the_lowest_with_enough_right_cars() -> None:
     labels = [[car(z, 0) for z in (10, 20, 30, 40)]]
     found = [[*(car(z, 1 - z / 100) for z in (10, 20, 30, 40)), car(15, 0.65), car(25, 0.3)]]
     assert operating_point(labels, found) == {"threshold": 0.325, "recall": 1.0, "precision": 0.8}
+    # Nothing of another class was reported: precision is undefined everywhere, and the first score as good as any.
+    assert operating_point(labels, found, "Cyclist")["threshold"] == 0.1

@@ -57,6 +57,7 @@ addEventListener("load", () => {
   said.all = low();
   key(document.body, "0");
   said.back = low();
+  said.start = document.getElementById("score-text").textContent;
   key(document.body, "j");
   key(document.body, "1");
   said.hidden = getComputedStyle(document.querySelector(".box.truth")).display;
@@ -103,8 +104,8 @@ def test_interactions_work_without_console_errors(run: RunFolder, tmp_path: Path
     assert (said["low"], said["all"], said["back"]) == ("2", "0", "2")
     # Completed 9 m, foreground and true depth 8 m, background 10 m, sigma 128 / 255, error 1 m on the car.
     values = said["values"].split("|")
-    assert values[1:] == ["9.00 m", "8.00 m", "10.00 m", "8.00 m", "0.50", "1.00 m"]
-    assert said["score"] == "1.00"
+    assert values[1:] == ["9.00 m", "8.00 m", "10.00 m", "2.00 m", "0.50", "8.00 m", "1.00 m"]
+    assert said["score"] == "Car 1.00"
 
 
 @pytest.mark.slow

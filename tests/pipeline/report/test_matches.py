@@ -59,6 +59,15 @@ def test_mistakes_come_worst_first_with_their_reason(example: MatchedFrames) -> 
     assert found[2].reason == "nothing there"
 
 
+def test_a_detection_in_a_dontcare_area_says_so(example: MatchedFrames) -> None:
+    """3D matching knows no DontCare areas: the detection is wrong there, but not for want of anything in the image."""
+    area = KittiObject("DontCare", -1, -1, -10, (70, 90, 190, 170), (-1, -1, -1), (-1000, -1000, -1000), -10)
+    found = matched({"a": [car(0, 20), area]}, {"a": [car(0, 20, 0.9), car(-20, 25, 0.2)]})
+    verdict = found.verdicts["a", "detection", 1]
+    assert (verdict.status, verdict.reason) == ("false positive", "in a DontCare area")
+    assert "counts all the same" in verdict_text(verdict)
+
+
 def test_verdicts_name_the_place_in_the_list(example: MatchedFrames) -> None:
     assert example.verdicts["a", "label", 0].status == "matched"
     assert verdict_text(example.verdicts["a", "label", 1]) == "missed: no detection overlaps"

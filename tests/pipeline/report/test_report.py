@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -15,9 +16,11 @@ from detection.kitti_format import KittiObject
 from pipeline.base.paths import RunFolder
 from pipeline.data import open_dataset
 from pipeline.report import pictures
-from pipeline.report.boxes import footprint, wireframe
+from pipeline.report.boxes import DrawnBox, drawn_boxes, footprint, wireframe
 from pipeline.report.page import spread
+from pipeline.report.views import tally
 from pipeline.run_folder.config import load_config
+from pipeline.run_folder.thresholds import ScoreThresholds
 from pipeline.scoring.scores import evaluate_run, mean_of, mean_steps
 from pipeline.scoring.tables import markdown_table, number
 from tests.pipeline.report.scored import score_and_report
@@ -182,10 +185,83 @@ def test_the_footprint_of_a_box_points_to_its_front() -> None:
 
 
 def test_objects_without_a_3d_box_are_not_drawn() -> None:
-    from pipeline.report.boxes import drawn_boxes
-
     area = KittiObject("DontCare", -1, -1, -10, (0, 0, 9, 9), (-1, -1, -1), (-1000, -1000, -1000), -10)
     assert drawn_boxes([area], CALIBRATION, (48, 96)) == []
+
+
+def person(x: float, score: float | None = None) -> KittiObject:
+    return KittiObject("Pedestrian", 0.0, 0, 0.0, (40, 10, 60, 40), (1.7, 0.6, 0.8), (x, 1.6, 12.0), 0.0, score)
+
+
+def boxes(items: list[KittiObject], statuses: list[str], met: list[float | None]) -> list[DrawnBox]:
+    drawn = drawn_boxes(items, CALIBRATION, (48, 96))
+    return [replace(box, status=status, met=score) for box, status, score in zip(drawn, statuses, met)]
+
+
+def test_counts_of_a_frame_add_up() -> None:
+    """Six labels: one found, one whose detection lies under the threshold, three missed, one that does not count."""
+    least = ScoreThresholds({"Pedestrian": 0.5})
+    truth = boxes(
+        [person(x) for x in range(6)],
+        ["matched", "matched", "missed", "missed", "missed", "ignored"],
+        [0.8, 0.4, None, None, None, None],
+    )
+    scores = [0.8, 0.4, 0.7, 0.6]
+    found = boxes([person(x, score) for x, score in enumerate(scores)],
+                  ["matched", "matched", "false positive", "ignored"], [None] * 4)  # fmt: skip
+    assert tally(truth, found, least) == (
+        "6 true: 1 found, 4 missed, 1 not counted; 3 predicted: 1 right, 1 false, 1 not counted"
+    )
+    assert tally(truth, None, least) == "6 true: 1 found, 4 missed, 1 not counted"
+    assert tally(None, found, ScoreThresholds()) == "4 predicted: 2 right, 1 false, 1 not counted"
+    assert tally(None, boxes([person(0, 0.9)], [""], [None]), least) == "1 predicted"
+
+
+def test_boxes_carry_their_names_in_the_image(run: RunFolder) -> None:
+    names = re.findall(r"<text class=\"name (\w+)[^>]*>(?:([^<]*)<)", score_and_report(run))
+    assert sorted(names) == [("found", "Car")] * 3 + [("truth", "Car")] * 3
+
+
+def test_without_labels_nothing_speaks_of_true_boxes(run: RunFolder) -> None:
+    shutil.rmtree(run.root.parent / "kitti" / "training" / "label_2")
+    text = score_and_report(run)
+    shown = re.sub(r"<(script|style)[^>]*>.*?</\1>", "", text, flags=re.DOTALL)
+    for word in ("true box", "show-truth", "missed", " true"):
+        assert word not in shown.replace("true depth", ""), word
+    assert "1 predicted" in shown
+
+
+def test_all_frames_can_be_reached(run: RunFolder) -> None:
+    """Three frames, two on a page: a summary with two of them, and two pages that hold all in order."""
+    index = score_and_report(run, "report.frames=2")
+    folder = run.report.parent
+    assert sorted(path.name for path in folder.glob("*.html")) == ["frames-1.html", "frames-2.html", "index.html"]
+    assert 'href="frames-1.html">000000 to 000001<' in index
+    assert 'href="frames-2.html">000002<' in index
+    pages = [(folder / f"frames-{n}.html").read_text(encoding="utf-8") for n in (1, 2)]
+    held = [re.findall(r'<article id="[^"]*" data-id="(\d+)"', page) for page in pages]
+    assert held == [["000000", "000001"], ["000002"]]
+    assert all('href="index.html"' in page and "Average precision" not in page for page in pages)
+    # One page fewer is asked for: the rest is named, and nothing of the earlier report is left.
+    index = score_and_report(run, "report.frames=2", "report.pages=1")
+    assert "more frames than" in index
+    assert not (folder / "frames-2.html").exists()
+    score_and_report(run)
+    assert [path.name for path in folder.glob("*.html")] == ["index.html"]
+
+
+def test_surfaces_are_visible_when_they_differ_in_one_pixel() -> None:
+    gap, valid = np.zeros((9, 9), np.float32), np.ones((9, 9), bool)
+    gap[4, 4] = 5.0
+    darkest = pictures.error_colours()[255]
+    assert (pictures.colour_gap(gap, valid) == darkest).all(axis=2).sum() == 25
+    sigma = np.full((9, 9), 1.0, np.float32)
+    shown = pictures.colour_sigma_between(sigma, gap, valid)
+    assert (shown == pictures.sigma_colours()[255]).all(axis=2).sum() == 25
+    assert (shown[0, 0] == pictures.UNDECIDED).all()
+    depth = np.array([[4.0, 9.0, 0.0]], np.float32)
+    assert pictures.widened(depth, nearest=True).tolist() == [[4.0, 4.0, 4.0]]
+    assert pictures.widened(depth, nearest=False).tolist() == [[9.0, 9.0, 9.0]]
 
 
 def test_small_functions() -> None:

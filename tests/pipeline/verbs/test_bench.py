@@ -29,12 +29,12 @@ def test_depth_cars_and_masks(streets: Path, tmp_path: Path, capsys: pytest.Capt
     assert (tmp_path / "real.md").read_text() == printed.rstrip("\n") + "\n"
     assert [line for line in printed.splitlines() if line and line[0] != "|"] == [
         "Completion on held-out rings, 2 frames (mm; %; s per frame)",
-        "Cars found, 2 frames (found/labelled; precision)",
+        "Objects found, 2 frames (found/labelled; precision)",
         "LiDAR points under masks, 2 frames (against the points in labelled 3D boxes)",
     ]
     found = json.loads((tmp_path / "real.json").read_text())
     assert [(entry["method"], entry["rows"]) for entry in found["completion"]] == [("nearest", 16)]
-    assert [(entry["rows"], len(entry["reports"])) for entry in found["detection"]] == [(64, 4), (16, 4)]
+    assert [(entry["rows"], len(entry["reports"])) for entry in found["detection"]] == [(64, 12), (16, 12)]
     assert [(entry["mask"], entry["group"]) for entry in found["masks"]] == [("truth", "vehicles"), ("truth", "people")]
 
 
@@ -45,7 +45,7 @@ def test_frames_without_labels(streets: Path, tmp_path: Path, capsys: pytest.Cap
     assert main([*BENCH, "--data", str(root), "--json"]) == 0
     printed = capsys.readouterr()
     assert set(json.loads(printed.out)) == {"frames", "completion"}
-    assert "cars and masks are not measured" in printed.err
+    assert "objects and masks are not measured" in printed.err
 
 
 @pytest.mark.parametrize(

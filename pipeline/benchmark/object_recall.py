@@ -1,7 +1,7 @@
-"""Recall and precision of detected cars on a handful of labelled frames, where AP would say little.
+"""Recall and precision of detected objects of a class on a handful of labelled frames, where AP would say little.
 
-AP over forty recall levels needs hundreds of objects. With eleven frames the honest questions are: of the cars a level
-asks for, how many were found; of what was reported, how much was a car; and how both change with distance.
+AP over forty recall levels needs hundreds of objects. With eleven frames the honest questions are: of the objects a
+level asks for, how many were found; of what was reported, how much was right; and how both change with distance.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Recall:
 
 
 @dataclass(frozen=True)
-class CarReport:
+class RecallReport:
     """recall by level and by distance range (metres, camera z), and precision = true / (true + false) detections."""
 
     iou: float
@@ -65,7 +65,7 @@ def level_of(item: KittiObject) -> int | None:
     return None
 
 
-def car_recall(
+def object_recall(
     labels: Sequence[Sequence[KittiObject]],
     detections: Sequence[Sequence[KittiObject]],
     *,
@@ -73,7 +73,7 @@ def car_recall(
     metric: str = "bev",
     score_threshold: float = -np.inf,
     object_class: str = "Car",
-) -> CarReport:
+) -> RecallReport:
     """Matches detections to labels frame by frame, best score first, one detection to one object.
 
     iou     overlap a match must exceed, from above (metric "bev") or in 3D ("3d")
@@ -113,7 +113,7 @@ def car_recall(
                 if near <= item.location[2] < far:
                     total_at[k] += 1
                     found_at[k] += hit
-    return CarReport(
+    return RecallReport(
         iou,
         metric,
         {name: Recall(int(found[k]), int(total[k])) for k, name in enumerate(LEVELS)},
