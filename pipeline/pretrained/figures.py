@@ -17,7 +17,7 @@ from pipeline.geometry.project import project_points
 from pipeline.geometry.rings import subsample_rows
 
 ROWS = (64, 32, 16, 8)
-# Share of right detections that the score thresholds in a card are chosen for, and the overlap from above that makes one
+# Share of right detections that score thresholds are chosen for, and the overlap from above that makes one
 # right. People are half a metre wide: at 0.5 a box a hand's breadth aside is wrong, and no score is sure enough.
 PRECISION = 0.8
 CLASS_IOU = {"Car": 0.7, "Pedestrian": 0.25, "Cyclist": 0.25}

@@ -76,6 +76,7 @@ class AugmentConfig(LibrarySection):
     depth_from: str | None = Field(
         default=None, description="folder of uint16 depth PNGs (ID.png) used instead of completion"
     )
+    check_depth: bool = Field(default=True, description="refuse maps of depth_from that do not fit the frame's LiDAR")
 
 
 class DetectionConfig(Section):

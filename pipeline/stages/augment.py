@@ -28,6 +28,7 @@ class AugmentStage(FrameStage):
     masks       source of object masks, as `pipeline.semantics.sources` takes it; None when `cloud` needs none
     convention  label convention of the masks, when there are some
     depth_from  folder of depth maps used instead of this run's completed depth
+    compare     refuse maps of that folder that do not fit the LiDAR
     seed        of the run
     """
 
@@ -35,6 +36,7 @@ class AugmentStage(FrameStage):
     masks: str | None
     convention: str | None
     depth_from: str | None
+    compare: bool
     seed: int
 
     code: ClassVar = (
@@ -52,7 +54,7 @@ class AugmentStage(FrameStage):
         """The augment section; what it says of masks counts only when some are needed."""
         section, cloud = config.augment, augment_settings(config)
         masks, convention = (section.semantics, section.convention) if cloud.needs_semantics else (None, None)
-        return cls(cloud, masks, convention, section.depth_from, config.seed)
+        return cls(cloud, masks, convention, section.depth_from, section.check_depth, config.seed)
 
     @property
     def mask_kind(self) -> str | None:
@@ -99,7 +101,7 @@ class AugmentStage(FrameStage):
         source = None if self.masks is None else open_semantics(self.masks, self.convention)
 
         def augment(frame: Frame, files: FrameOutputs) -> None:
-            completed = with_sigma(completed_depth(self.depth_from, frame, files), self.cloud)
+            completed = with_sigma(completed_depth(self.depth_from, self.compare, frame, files), self.cloud)
             semantics = source.semantics(frame) if source is not None else None
             seed = derive_seed(self.seed, frame.id, "augment")
             files.write_cloud(augment_frame(completed, lidar_of(frame), frame.calibration, self.cloud, semantics, seed))

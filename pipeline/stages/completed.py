@@ -13,11 +13,14 @@ if TYPE_CHECKING:
     from pipeline.pointcloud.presets import AugmentSettings
 
 
-def completed_depth(depth_from: str | None, frame: Frame, files: FrameOutputs) -> CompletedDepth:
-    """Completed depth of this run, or of the folder `depth_from`. Raises DataError for an unusable file."""
+def completed_depth(depth_from: str | None, compare: bool, frame: Frame, files: FrameOutputs) -> CompletedDepth:
+    """Completed depth of this run, or of the folder `depth_from`. Raises DataError for an unusable file.
+
+    compare  refuse a map of the folder that does not fit the frame's LiDAR
+    """
     if depth_from is None:
         return files.read_completed()
-    return read_depth_folder(depth_from, frame.id, frame.image_size)
+    return read_depth_folder(depth_from, frame.id, frame.image_size, frame.sparse_depth if compare else None)
 
 
 def with_sigma(completed: CompletedDepth, settings: AugmentSettings) -> CompletedDepth:

@@ -72,7 +72,7 @@ DECLARED = {
         "weights": {"depth.safetensors", "depth.json"},
     },
     "augment": {
-        "settings": {"cloud", "masks", "convention", "depth_from", "seed"},
+        "settings": {"cloud", "masks", "convention", "depth_from", "compare", "seed"},
         "parts": {"points", "calibration", "sparse_depth", "image", "image_size", "labels", "semantics"},
         "reads": {"depth", "twin"},
         "user_files": {f"{ID}.png", "mask.json"},
@@ -165,6 +165,7 @@ CHANGES: tuple[tuple[str | None, str, Any, set[str]], ...] = (
     ("augment", "semantics", "truth", {"augment"}),
     ("augment", "convention", "kitti", {"augment"}),
     ("augment", "depth_from", "{root}/depth", {"augment"}),
+    ("augment", "check_depth", False, {"augment"}),
     ("detection", "model", "small_lidar", {"detect"}),
     ("detection", "device", "cuda", {"detect"}),
 )
