@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from completion.models.rings import interpolate_rings
 from completion.types import CompletedDepth
 from pipeline.base.paths import RunFolder
 from pipeline.data.depth_png import write_depth_png
@@ -99,7 +100,7 @@ def write_inputs(root: Path) -> Path:
         (folder / part).mkdir(parents=True)
         shutil.copy(training / kitti.format(ID), folder / part)
     write_depth_png(folder / "sparse_depth" / f"{ID}.png", frame.sparse_depth)
-    write_depth_png(root / "depth" / f"{ID}.png", frame.target_depth[8:])
+    write_depth_png(root / "depth" / f"{ID}.png", interpolate_rings(frame.sparse_depth)[8:])
     (root / "masks").mkdir()
     cv2.imwrite(str(root / "masks" / f"{ID}.png"), frame.semantics)
     (root / "masks" / "mask.json").write_text('{"convention": "cityscapes_trainIds"}')
