@@ -94,7 +94,10 @@ def read_torch_pickle(path: str | Path) -> Any:
                 raise CheckpointError(f"{path}: refused, nothing in it was executed: {_reason(error)}") from error
             seen.add(named.group(1))
             allowed.append((_stand_in(named.group(1)), named.group(1)))
-        except (RuntimeError, EOFError, ValueError, KeyError, AttributeError, TypeError, IndexError) as error:
+        except FileNotFoundError:
+            raise
+        # OSError: torch seeks before the beginning of some torn files.
+        except (OSError, RuntimeError, EOFError, ValueError, KeyError, AttributeError, TypeError, IndexError) as error:
             raise CheckpointError(f"{path}: expected a PyTorch checkpoint, cannot read it: {error}") from error
     raise CheckpointError(f"{path}: refused: it mentions more than {_MOST_CLASSES} classes")
 

@@ -43,16 +43,16 @@ def save_checkpoint(model: nn.Module, preset: Preset, path: str | Path, facts: M
 
     facts  added to the card: steps, seed, data, metrics, ...
     """
+    identity = {"preset": preset.name, "options": preset.options, "classes": list(preset.classes)}
+    return write_card(model, identity, path, facts)
+
+
+def write_card(model: nn.Module, identity: Mapping[str, Any], path: str | Path, facts: Mapping[str, Any]) -> Path:
+    """Write the weights of a network and a card that says which network it is (`identity`) and more `facts`."""
     path = Path(path)
     digest = save_tensors(path, model.state_dict())
-    card = {
-        "preset": preset.name,
-        "options": preset.options,
-        "classes": list(preset.classes),
-        "parameters": sum(parameter.numel() for parameter in model.parameters()),
-        "sha256": digest,
-        **facts,
-    }
+    parameters = sum(parameter.numel() for parameter in model.parameters())
+    card = {**identity, "parameters": parameters, "sha256": digest, **facts}
     write_bytes(path.with_suffix(".json"), (json.dumps(card, indent=2, sort_keys=True) + "\n").encode())
     return path
 

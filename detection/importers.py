@@ -21,10 +21,10 @@ from detection.models.presets import pointrcnn, pointrcnn2
 
 
 def read_tensors(path: str | Path) -> dict[str, Tensor]:
-    """The tensors of `model_state`, `state_dict` or a bare state dict; a leading `module.` is taken off."""
+    """The tensors of `model_state`, `state_dict` and the like or a bare state dict; `module.` in front is taken off."""
     content = read_torch_pickle(path)
     if isinstance(content, Mapping):
-        for key in ("model_state", "state_dict", "model"):
+        for key in ("model_state", "state_dict", "model", "model_state_dict"):
             if isinstance(content.get(key), Mapping):
                 content = content[key]
                 break

@@ -111,6 +111,8 @@ def project(conv: PointwiseWeight, norm: nn.Module | None, rows: Tensor) -> Tens
         projected: Tensor = conv(rows)
         return projected if norm is None else cast(Tensor, norm(projected))
     scale, shift = _batch_norm(norm).as_affine()
+    if conv.bias is not None:
+        shift = torch.addcmul(shift, conv.bias, scale)
     return F.linear(rows, conv.matrix * scale[:, None], shift)
 
 

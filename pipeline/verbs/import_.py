@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 # The published network whose features the segmentation network of `pipeline.semantics.pyramid` stands on.
 BACKBONE = "efficientnet_lite0"
+FRUSTUM = "frustum_pointnet"
 
 EXAMPLES = """\
 examples:
@@ -37,8 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         metavar="NAME",
         help="twise, twise_maxpool, msg_chn, msg_chn_wacv, sparse_to_dense, nlspn; pointrcnn, epnet, "
-        "openpcdet_pointrcnn, pointpillar, second, voxel_rcnn, pv_rcnn; efficientnet_lite0 (backbone to train a "
-        "segmentation network on); or 'results' for a result pickle",
+        "openpcdet_pointrcnn, pointpillar, second, voxel_rcnn, pv_rcnn, frustum_pointnet; efficientnet_lite0 (backbone "
+        "to train a segmentation network on); or 'results' for a result pickle",
     )
     parser.add_argument(
         "--choose",
@@ -46,7 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="NAME=VALUE",
         help="what the file does not tell, repeatable; nlspn: legacy and preserve_input, both true for the authors' "
-        "released weights, and affinity (AS, ASS, TC, TGASS), iterations (18)",
+        "released weights, and affinity (AS, ASS, TC, TGASS), iterations (18); frustum_pointnet: variant, tf (the "
+        "original) or port",
     )
     out = "NAME.safetensors, or the folder of result files"
     parser.add_argument("--out", type=Path, required=True, metavar="FILE|DIR", help=out)
@@ -94,7 +96,7 @@ def import_weights(path: Path, architecture: str, out: Path, choices: Mapping[st
     from completion.importers import ARCHITECTURES
     from detection.models.presets import IMPORTED_PRESETS
 
-    known = (*ARCHITECTURES, *IMPORTED_PRESETS, BACKBONE)
+    known = (*ARCHITECTURES, *IMPORTED_PRESETS, FRUSTUM, BACKBONE)
     if architecture not in known:
         raise UsageError(f"unknown architecture {architecture!r}; known: {', '.join(known)}, results")
     try:
@@ -102,6 +104,8 @@ def import_weights(path: Path, architecture: str, out: Path, choices: Mapping[st
             from completion.checkpoints import convert_checkpoint
 
             return convert_checkpoint(path, architecture, out, **(choices or {}))
+        if architecture == FRUSTUM:
+            return _import_frustum(path, out, dict(choices or {}))
         if choices:
             raise UsageError(f"--choose: {architecture} leaves nothing to choose")
         if architecture == BACKBONE:
@@ -142,6 +146,19 @@ def _import_detector(path: Path, architecture: str, out: Path) -> Path:
         "architecture": architecture,
     }
     return save_checkpoint(model, IMPORTED_PRESETS[architecture](model), out, facts)
+
+
+def _import_frustum(path: Path, out: Path, choices: dict[str, object]) -> Path:
+    from detection.frustum.checkpoints import import_frustum_pointnet, save_frustum_checkpoint
+
+    variant = str(choices.pop("variant", ""))
+    if choices or variant not in ("tf", "port"):
+        raise UsageError(
+            "frustum_pointnet: give --choose variant=tf (the original) or variant=port (the common PyTorch port), and "
+            "nothing else; the files have equal shapes, but the two compute different things"
+        )
+    source = {"imported_from": path.name, "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    return save_frustum_checkpoint(import_frustum_pointnet(path, variant), out, source)
 
 
 def import_results(path: Path, out: Path) -> ImportedResults:
