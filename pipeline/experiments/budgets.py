@@ -53,16 +53,16 @@ class CompletionBudget:
 
 # Process time of a step and of scoring a test frame, by network; "paper" is scaled from "small" by operations.
 _SMOKE = (
-    {"multistack": 0.05, "resnet18": 0.1, "resnet18 dc": 0.1},
-    {"multistack": 0.2, "resnet18": 0.2, "resnet18 dc": 0.3},
+    {"multistack": 0.05, "nlspn": 0.2, "resnet18": 0.1, "resnet18 dc": 0.1},
+    {"multistack": 0.2, "nlspn": 0.5, "resnet18": 0.2, "resnet18 dc": 0.3},
 )
 _SMALL = (
-    {"multistack": 0.034, "resnet18": 0.04, "resnet18 dc": 0.06},
-    {"multistack": 0.2, "resnet18": 0.2, "resnet18 dc": 0.4},
+    {"multistack": 0.034, "nlspn": 0.2, "resnet18": 0.04, "resnet18 dc": 0.06},
+    {"multistack": 0.2, "nlspn": 0.8, "resnet18": 0.2, "resnet18 dc": 0.4},
 )
 _PAPER = (
-    {"multistack": 140.0, "resnet18": 350.0, "resnet18 dc": 400.0},
-    {"multistack": 12.0, "resnet18": 30.0, "resnet18 dc": 60.0},
+    {"multistack": 140.0, "nlspn": 700.0, "resnet18": 350.0, "resnet18 dc": 400.0},
+    {"multistack": 12.0, "nlspn": 60.0, "resnet18": 30.0, "resnet18 dc": 60.0},
 )
 
 COMPLETION: dict[str, CompletionBudget] = {

@@ -28,6 +28,7 @@ SAMPLES = 500
 NETWORKS: dict[str, tuple[str | None, str | None, str | None]] = {
     "multistack": ("msg_chn", "twise", None),
     "resnet18": ("sparse_to_dense", "twise_resnet", "resnet_dc_to_dc"),
+    "nlspn": ("nlspn", None, None),
     "resnet18_plain": ("resnet_depth_to_depth", None, None),
     "resnet18_dc_input": ("resnet_dc_to_depth", None, None),
     "resnet18_depth_input": (None, None, "resnet_depth_to_dc"),
@@ -46,6 +47,9 @@ def model_spec(recipe: Recipe, budget: CompletionBudget) -> ModelSpec:
     arguments: dict[str, Any] = {"channels": budget.channels, "init": budget.init}
     if network == "multistack":
         arguments |= {"extra_skips": False}
+    elif network == "nlspn":
+        # The authors' ResNet-34 at the published width, half as deep in narrow networks.
+        arguments = {"layers": 34 if budget.resnet_width >= 64 else 18, "width": budget.resnet_width}
     else:
         arguments = {"width": budget.resnet_width}
         if "dc" in name:

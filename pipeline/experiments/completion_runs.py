@@ -56,7 +56,7 @@ def cost(recipe: Recipe, budget: CompletionBudget) -> Cost:
 
 
 def cost_name(recipe: Recipe) -> str:
-    """Key of the measured times in the budget: "multistack", "resnet18" or "resnet18 dc"."""
+    """Key of the measured times in the budget: "multistack", "nlspn", "resnet18" or "resnet18 dc"."""
     network = str(recipe.settings["network"]).split("_")[0]
     return f"{network} dc" if recipe.settings["loss"] == "dc" else network
 

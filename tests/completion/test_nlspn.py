@@ -11,8 +11,12 @@ from torch import Tensor
 
 from completion.cpu.propagation import confidence_times, propagated
 from completion.cpu.row_threads import RowThreads
+from completion.inputs import scale_rgb
+from completion.models import build_model, default_spec
 from completion.models.deformable import propagate, sample, times_confidence
 from completion.models.nlspn import AFFINITIES, NLSPN, NonLocalPropagation
+from completion.training_loss import LossSettings, training_loss
+from tests.completion.scenes import street
 from tests.reference import completion_deformable as twin
 
 SIZE = (6, 7)
@@ -187,3 +191,30 @@ def test_wrong_arguments_are_named() -> None:
         NLSPN(kernel=4, width=4)
     with pytest.raises(ValueError, match="colour"):
         NLSPN(layers=18, width=4)(torch.zeros(1, 1, 8, 8), torch.zeros(1, 3, 8, 9))
+
+
+def test_it_overfits_two_frames() -> None:
+    torch.manual_seed(0)
+    spec = default_spec("nlspn", layers=18, width=8, iterations=3)
+    model = build_model(spec)
+    frames = [street(seed, 24, 40, 6) for seed in (1, 2)]
+    sparse, target = (
+        torch.from_numpy(np.stack([getattr(f, name) for f in frames]))[:, None] for name in ("sparse", "target")
+    )
+    rgb = scale_rgb(torch.from_numpy(np.stack([f.image for f in frames])).permute(0, 3, 1, 2), spec.rgb)
+    optimiser = torch.optim.Adam(model.parameters(), lr=5e-3)
+
+    def error() -> float:
+        with torch.no_grad():
+            return float((model.eval()(sparse, rgb) - target).abs().mean())
+
+    untrained = error()
+    for _ in range(100):
+        optimiser.zero_grad()
+        outputs = (model.train()(sparse, rgb),)
+        training_loss(outputs, sparse, target, spec, LossSettings("l1_l2"), (1.0,), 0.0)["loss"].backward()
+        optimiser.step()
+    assert untrained > 20
+    assert error() < 2
+    assert all(p.grad is not None for p in model.parameters() if p.requires_grad)
+    assert float(model.prop_layer.conv_offset_aff.weight.detach().abs().max()) > 0.01

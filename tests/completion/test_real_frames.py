@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from completion.infer import network_completer
+from completion.checkpoints import Card, save_checkpoint
+from completion.infer import load_completer, network_completer
 from completion.metrics import depth_metrics
 from completion.models import build_model, default_spec
 from completion.models.classical import linear_inverse_depth, nearest_depth
@@ -35,3 +36,15 @@ def test_a_network_completes_a_real_frame_at_full_size(kitti_object: Path) -> No
     assert completed.size == frame.image.shape[:2]
     measured = frame.sparse_depth > 0
     assert np.median(np.abs(completed.depth - frame.sparse_depth)[measured]) < 1.0  # untrained, it already interpolates
+
+
+def test_nlspn_completes_a_real_frame_through_its_kernels(kitti_object: Path, tmp_path: Path) -> None:
+    """Before any training its affinities are 0: measured pixels stay as they are, sizes that are odd somewhere too."""
+    frame = open_dataset("kitti_object", kitti_object)["000003"]
+    torch.manual_seed(0)
+    spec = default_spec("nlspn", layers=18, width=4)
+    path = save_checkpoint(tmp_path / "nlspn", build_model(spec), Card(spec, "depth"))
+    completed = load_completer(path, backend="auto").complete(frame.sparse_depth, frame.image)
+    assert completed.size == frame.image.shape[:2]
+    measured = frame.sparse_depth > 0
+    np.testing.assert_array_equal(completed.depth[measured], frame.sparse_depth[measured])

@@ -61,8 +61,9 @@ def test_two_processes_take_the_steps_of_one(tmp_path: Path) -> None:
         torch.testing.assert_close(two[name], value, rtol=1e-2, atol=2e-3)
 
 
-def test_stopping_by_time_and_going_on(tmp_path: Path) -> None:
-    whole = replace(settings("selection"), max_steps=5, validate_every=0)
+@pytest.mark.parametrize("architecture", ["selection", "nlspn"])
+def test_stopping_by_time_and_going_on(tmp_path: Path, architecture: str) -> None:
+    whole = replace(settings(architecture), max_steps=5, validate_every=0)
     first = train(whole, Streets(11, 64, 96), tmp_path / "run", seconds=0.0)
     assert load_checkpoint(first)[1].training["step"] == 1
     last = train(whole, Streets(11, 64, 96), tmp_path / "run")

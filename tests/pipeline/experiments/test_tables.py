@@ -134,9 +134,10 @@ def test_unknown_numbers_name_the_nearest_table() -> None:
 
 def test_lidar_rows_choose_or_replace() -> None:
     chosen = find("table", "4.8").with_lidar_rows(16)
-    assert [row.label for row in chosen.rows if row.recipe] == ["16R DC", "16R MultiStack", "16R TWISE"]
+    assert [row.label for row in chosen.rows if row.recipe] == ["16R DC", "16R MultiStack", "16R NLSPN", "16R TWISE"]
     assert {claim.text for claim in chosen.claims} == {
         "16R: TWISE has the lowest MAE",
+        "16R: TWISE has a lower MAE than NLSPN",
         "16R: TWISE has the lower RMSE",
     }
     replaced = find("table", "4.7").with_lidar_rows(16)
