@@ -16,9 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from completion.cpu import winograd
+from completion.cpu import convolutions, strided, winograd
+from completion.cpu.patches import COARSER, NOTHING, Added, Layer, Summands, bias_of
 from completion.cpu.row_threads import RowThreads
-from completion.cpu.winograd import COARSER, NOTHING, RECTIFIED
 from completion.executors import Forward
 from completion.models.blocks import DepthDecoder, DepthEncoder, RgbEncoder
 from completion.models.hourglass import Hourglasses
@@ -33,48 +33,39 @@ class _Pair:
     def __init__(self, block: nn.Sequential, kernels: RowThreads, name: str) -> None:
         first, second = (layer for layer in block if not isinstance(layer, nn.ReLU))
         self.kernels, self.name, self.channels = kernels, name, int(first.out_channels)  # type: ignore[arg-type]
-        self.first, self.first_bias = _prepared(first), winograd.bias_of(first)
-        self.second, self.second_bias = _prepared(second), winograd.bias_of(second)
+        self.first, self.second = (Layer(_prepared(layer), bias_of(layer)) for layer in (first, second))
 
     def stem(self, planes: Float, coarse: Float | None) -> Float:
         """Planes (K, H, W) -> (H, W, C), plus a coarser map upsampled."""
         out = self.kernels.map(self.name, *planes.shape[1:], self.channels)
-        above = (out, NOTHING) if coarse is None else (coarse, COARSER)
-        weights = self.first, self.first_bias, self.second, self.second_bias
-        self.kernels.run(winograd.convolve_stem, winograd.tile_rows(out), planes, *weights, *above, out)
+        convolutions.convolve_stem(self.kernels, planes, self.first, self.second, _above(coarse, out), out)
         return out
 
     def halving(self, x: Float, coarse: Float | None = None) -> Float:
         """(H, W, C) -> (H/2, W/2, C), plus a coarser map upsampled."""
         hidden = self._hidden(x.shape[0] // 2, x.shape[1] // 2)
-        self.kernels.run(winograd.halve, len(hidden), x, self.first, self.first_bias, hidden)
+        convolutions.halve(self.kernels, x, self.first, hidden)
         return self._second((hidden,), self.name, coarse)
 
     def doubling(self, summands: Features) -> Float:
         """Maps (H, W, C) to be added -> (2H, 2W, C)."""
         height, width, _ = summands[0].shape
         hidden = self._hidden(2 * height, 2 * width)
-        self.kernels.run(winograd.double, height, *_three(summands), self.first, self.first_bias, hidden)
+        convolutions.double(self.kernels, Summands.of(summands), self.first, hidden)
         return self._second((hidden,), self.name)
 
     def head(self, summands: Features) -> Float:
         """Maps (H, W, C) to be added -> planes (K, H, W)."""
         height, width, _ = summands[0].shape
         hidden = self._hidden(height, width)
-        weights = self.first, self.first_bias
-        rows = winograd.tile_rows(hidden)
-        self.kernels.run(winograd.convolve, rows, *_three(summands), RECTIFIED, *weights, hidden, NOTHING, hidden)
-        out = np.empty((len(self.second_bias), height, width), np.float32)
-        self.kernels.run(winograd.convolve_head, height, hidden, self.second, self.second_bias, out)
+        convolutions.convolve(self.kernels, Summands.of(summands), self.first, Added(hidden, NOTHING), hidden)
+        out = np.empty((len(self.second.bias), height, width), np.float32)
+        convolutions.convolve_head(self.kernels, hidden, self.second, out)
         return out
 
     def _second(self, summands: Features, name: str, coarse: Float | None = None) -> Float:
         out = self.kernels.map(name, *summands[0].shape[:2], self.channels)
-        above = (out, NOTHING) if coarse is None else (coarse, COARSER)
-        weights = self.second, self.second_bias
-        self.kernels.run(
-            winograd.convolve, winograd.tile_rows(out), *_three(summands), RECTIFIED, *weights, *above, out
-        )
+        convolutions.convolve(self.kernels, Summands.of(summands), self.second, _above(coarse, out), out)
         return out
 
     def _hidden(self, height: int, width: int) -> Float:
@@ -86,21 +77,20 @@ class _Pair:
         return flat[:size].reshape(height, width, self.channels)
 
 
-def _three(summands: Features) -> tuple[Float, Float, Float, int]:
-    """Maps for a kernel that adds one to three."""
-    padded = (*summands, summands[0], summands[0])
-    return padded[0], padded[1], padded[2], len(summands)
+def _above(coarse: Float | None, out: Float) -> Added:
+    """A coarser map upsampled, or nothing."""
+    return Added(out, NOTHING) if coarse is None else Added(coarse, COARSER)
 
 
 def _prepared(layer: Any) -> Float:
     """Weights as the kernel of this kind of layer takes them."""
     if isinstance(layer, nn.ConvTranspose2d):
-        return winograd.tap_weights(layer.weight, transposed=True)
+        return strided.tap_weights(layer.weight, transposed=True)
     if layer.stride[0] == 2:
-        return winograd.tap_weights(layer.weight)
+        return strided.tap_weights(layer.weight)
     if layer.in_channels <= 3:
         return winograd.stem_weights(layer.weight)
-    return winograd.head_weights(layer.weight) if layer.out_channels <= 3 else winograd.winograd_weights(layer.weight)
+    return strided.head_weights(layer.weight) if layer.out_channels <= 3 else winograd.winograd_weights(layer.weight)
 
 
 def _planes(x: Tensor) -> Float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from completion.cpu import winograd
+from completion.cpu import convolutions, strided, winograd
+from completion.cpu.patches import LINEAR, NOTHING, RECTIFIED, SAME, Added, Layer, Summands, bias_of
 from completion.cpu.row_threads import RowThreads
 from completion.cpu.small_gemm import multiply, with_whole_lanes
-from completion.cpu.winograd import LINEAR, NOTHING, RECTIFIED, SAME
 from completion.models.selection import PixelUNet, Residual
 
 Float = NDArray[np.float32]
@@ -42,8 +42,8 @@ class PixelUNetKernels:
         self.lock = threading.Lock()
         self.stem = _winograd(network.stem)
         self.encoder = [[_residual(one) for one in stage.children()] for stage in network.encoder]
-        self.down = [(winograd.quarter_weights(one.weight), winograd.bias_of(one)) for one in network.down]  # type: ignore[arg-type]
-        self.up = [(with_whole_lanes(_array(one.weight[:, :, 0, 0].T)), winograd.bias_of(one)) for one in network.up]  # type: ignore[index]
+        self.down = [Layer(strided.quarter_weights(one.weight), bias_of(one)) for one in network.down]  # type: ignore[arg-type]
+        self.up = [Layer(with_whole_lanes(_array(one.weight[:, :, 0, 0].T)), bias_of(one)) for one in network.up]  # type: ignore[index]
         self.decoder = [_residual(one) for one in network.decoder]
         read = network.head.weight[:, :, 0, 0], _tensor(network.head.bias)
         self.head = Head(_head(read[0], outputs), _head(read[1], outputs))
@@ -69,29 +69,26 @@ class PixelUNetKernels:
             x = self._residuals(f"decoder {level}", x, [self.decoder[level]])
         return x
 
-    def _residuals(self, name: str, x: Float, layers: list[Any]) -> Float:
+    def _residuals(self, name: str, x: Float, layers: list[tuple[Layer, Layer]]) -> Float:
         for number, (first, second) in enumerate(layers):
             hidden = self._convolve(f"{name} hidden", x, RECTIFIED, first)
             x = self._convolve(f"{name} {number}", hidden, RECTIFIED, second, x)
         return x
 
-    def _convolve(self, name: str, x: Float, least: object, layer: Any, added: Float | None = None) -> Float:
-        weights, bias = layer
-        out = self.rows.map(name, *x.shape[:2], len(bias))
-        other = (out, NOTHING) if added is None else (added, SAME)
-        self.rows.run(winograd.convolve, winograd.tile_rows(out), x, x, x, 1, least, weights, bias, *other, out)
+    def _convolve(self, name: str, x: Float, least: np.float32, layer: Layer, added: Float | None = None) -> Float:
+        out = self.rows.map(name, *x.shape[:2], len(layer.bias))
+        other = Added(out, NOTHING) if added is None else Added(added, SAME)
+        convolutions.convolve(self.rows, Summands.of((x,), least), layer, other, out)
         return out
 
-    def _quarter(self, name: str, x: Float, layer: Any) -> Float:
-        height, width, channels = x.shape
-        out = self.rows.map(name, height // 2, width // 2, len(layer[1]))
-        pairs = x.reshape(height // 2, 2, width // 2, 2 * channels)
-        self.rows.run(winograd.quarter, len(out), pairs, *layer, out)
+    def _quarter(self, name: str, x: Float, layer: Layer) -> Float:
+        out = self.rows.map(name, x.shape[0] // 2, x.shape[1] // 2, len(layer.bias))
+        convolutions.quarter(self.rows, x, layer, out)
         return out
 
-    def _lift(self, name: str, x: Float, layer: Any, skip: Float) -> Float:
+    def _lift(self, name: str, x: Float, layer: Layer, skip: Float) -> Float:
         out = self.rows.map(name, *skip.shape)
-        self.rows.run(winograd.lift, len(x), x, *layer, skip, out)
+        convolutions.lift(self.rows, x, layer, skip, out)
         return out
 
 
@@ -116,11 +113,11 @@ def _array(x: Tensor) -> Float:
     return np.asarray(x.detach().contiguous().numpy())
 
 
-def _winograd(layer: nn.Conv2d) -> tuple[Float, Float]:
-    return winograd.winograd_weights(layer.weight), winograd.bias_of(layer)
+def _winograd(layer: nn.Conv2d) -> Layer:
+    return Layer(winograd.winograd_weights(layer.weight), bias_of(layer))
 
 
-def _residual(block: nn.Module) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
+def _residual(block: nn.Module) -> tuple[Layer, Layer]:
     assert isinstance(block, Residual)
     return _winograd(block.conv1), _winograd(block.conv2)
 

@@ -14,13 +14,13 @@ interpreter and write every pixel of it, so that rows can be shared among thread
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
+from completion.cpu.patches import COARSER, NOTHING, gather
 from completion.cpu.small_gemm import ROWS, multiply, with_whole_lanes
 
 Float = NDArray[np.float32]
@@ -29,18 +29,12 @@ _POINTS = (0.0, _A, -_A, _B, -_B)
 _a, _b, _a2, _b2, _a3, _b3 = (np.float32(value) for value in (_A, _B, _A**2, _B**2, _A**3, _B**3))
 _SUM = np.float32(2.5)  # a^2 + b^2; a^2 b^2 is 1
 _ZERO, _ONE = np.float32(0), np.float32(1)
-# Lower bounds of the inputs of a convolution.
-RECTIFIED, LINEAR = np.float32(0), np.float32(-np.inf)
-# What a convolution adds to its result: nothing, a map of its size, a coarser one (bilinear with aligned corners).
-NOTHING, SAME, COARSER = 0, 1, 2
-# Pixels of a block of `halve`, `double` and `convolve_head`: few enough for a block to stay in the second-level cache.
-PIXELS = 8 * ROWS
 
 
 def winograd_weights(weight: Tensor) -> Float:
     """Weights (O, I, 3, 3) -> (36, I, O') for `convolve`, computed in float64.
 
-    O' is O with whole lanes (see `small_product`), here and in all weights below.
+    O' is O with whole lanes (see `small_gemm`), here and in all weights below.
     """
     rows = []
     for point in _POINTS:
@@ -65,35 +59,6 @@ def _interpolated(m0, m1, m2, m3, m4, m5):  # type: ignore[no-untyped-def]
     """One direction of the transform of outputs: six points -> four samples."""
     s, d, t, u = m1 + m2, m1 - m2, m3 + m4, m3 - m4
     return m0 + s + t, _a * d + _b * u, _a2 * s + _b2 * t, _a3 * d + _b3 * u + m5
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _gather(x, y, z, summands, least, top, left, rows, columns, step, patch):  # type: ignore[no-untyped-def]
-    """patch (rows, columns, C): the sum of one to three maps from (top, left), cut at `least`, zeros outside.
-
-    With step 2 the even columns come first, then the odd ones.
-    """
-    height, width, channels = x.shape
-    for i in range(rows):
-        r = top + i
-        for j in range(columns):
-            place = j if step == 1 else (j % 2) * ((columns + 1) // 2) + j // 2
-            q = left + j
-            if r < 0 or r >= height or q < 0 or q >= width:
-                for c in range(channels):
-                    patch[i, place, c] = _ZERO
-            elif summands == 1:
-                for c in range(channels):
-                    value = x[r, q, c]
-                    patch[i, place, c] = value if value > least else least
-            elif summands == 2:
-                for c in range(channels):
-                    value = x[r, q, c] + y[r, q, c]
-                    patch[i, place, c] = value if value > least else least
-            else:
-                for c in range(channels):
-                    value = x[r, q, c] + y[r, q, c] + z[r, q, c]
-                    patch[i, place, c] = value if value > least else least
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
@@ -224,25 +189,28 @@ def _blocks(weights, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def convolve(first, last, x, y, z, summands, least, weights, bias, other, kind, out):  # type: ignore[no-untyped-def]
-    """Rows of tiles first..last of out (H, W, O): x + y + z, cut at `least`, convolved, plus bias, plus another map.
+def convolve(first, last, summands, layer, added, out):  # type: ignore[no-untyped-def]
+    """Rows of tiles first..last of out (H, W, O): `Summands`, convolved by a `Layer`, plus its bias, plus `Added`.
 
-    x, y, z    (H, W, I), of which the first `summands` count
-    weights    (36, I, O'), see `winograd_weights`
-    least      RECTIFIED or LINEAR
-    other      (H, W, O) or (h, w, O), as `kind` says: NOTHING, SAME or COARSER
+    layer  weights (36, I, O'), see `winograd_weights`
     """
+    x, y, z, terms, least = summands
+    weights, bias = layer
+    other, kind = added
     tiles, across, patch, work = _blocks(weights, out)
     for row in range(first, last):
         for start in range(0, across, tiles):
             count = min(tiles, across - start)
-            _gather(x, y, z, summands, least, 4 * row - 1, 4 * start - 1, 6, 4 * count + 2, 1, patch)
+            gather(x, y, z, terms, least, 4 * row - 1, 4 * start - 1, 6, 4 * count + 2, 1, patch)
             _finish(patch, weights, bias, row, start, count, other, kind, work, out)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def convolve_stem(first, last, planes, stem, stem_bias, weights, bias, other, kind, out):  # type: ignore[no-untyped-def]
-    """`convolve` of the rectified convolution of planes (K, H, W) by stem (9 K, I') and its bias (`stem_weights`)."""
+def convolve_stem(first, last, planes, stem_layer, layer, added, out):  # type: ignore[no-untyped-def]
+    """`convolve` of the rectified convolution of planes (K, H, W) by a first layer (9 K, I'), see `stem_weights`."""
+    stem, stem_bias = stem_layer
+    weights, bias = layer
+    other, kind = added
     tiles, across, patch, work = _blocks(weights, out)
     kinds, columns = len(planes), patch.shape[1]
     stem_work = (
@@ -262,143 +230,6 @@ def tile_rows(out: Float) -> int:
     return (len(out) + 3) // 4
 
 
-def bias_of(layer: Any) -> Float:
-    """The bias (O,) of a convolution."""
-    return np.asarray(layer.bias.detach().contiguous().numpy())
-
-
-def tap_weights(weight: Tensor, transposed: bool = False) -> Float:
-    """Weights (O, I, 3, 3), or (I, O, 3, 3) when transposed -> (9, I, O') for `halve` and `double`."""
-    order = (2, 3, 0, 1) if transposed else (2, 3, 1, 0)
-    return with_whole_lanes(weight.detach().permute(order).flatten(0, 1).numpy())
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def halve(first, last, x, weights, bias, out):  # type: ignore[no-untyped-def]
-    """Rows first..last of out (H/2, W/2, O): relu(x), (H, W, I), convolved with stride 2 and padding 1, plus bias."""
-    inputs, columns = weights.shape[1:]
-    patch = np.empty((3, 2 * PIXELS + 1, inputs), np.float32)
-    m = np.empty((9, PIXELS, columns), np.float32)
-    width = out.shape[1]
-    for row in range(first, last):
-        for start in range(0, width, PIXELS):
-            n = min(PIXELS, width - start)
-            _gather(x, x, x, 1, RECTIFIED, 2 * row - 1, 2 * start - 1, 3, 2 * n + 1, 2, patch)
-            for i in range(3):
-                multiply(patch[i, :n], weights[3 * i], m[3 * i, :n])
-                multiply(patch[i, n + 1 : 2 * n + 1], weights[3 * i + 1], m[3 * i + 1, :n])
-                multiply(patch[i, 1 : n + 1], weights[3 * i + 2], m[3 * i + 2, :n])
-            for j in range(n):
-                for c in range(len(bias)):
-                    upper = m[0, j, c] + m[1, j, c] + m[2, j, c]
-                    middle = m[3, j, c] + m[4, j, c] + m[5, j, c]
-                    lower = m[6, j, c] + m[7, j, c] + m[8, j, c]
-                    out[row, start + j, c] = bias[c] + (upper + middle + lower)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def double(first, last, x, y, z, summands, weights, bias, out):  # type: ignore[no-untyped-def]
-    """Rows first..last of x (H, W, I) -> two rows each of out (2H, 2W, O): relu(x + y + z) by a transposed convolution
-    of stride 2 (padding and output padding 1), plus bias."""
-    inputs, columns = weights.shape[1:]
-    patch = np.empty((2, PIXELS + 1, inputs), np.float32)
-    m = np.empty((9, PIXELS, columns), np.float32)
-    width = x.shape[1]
-    for row in range(first, last):
-        for start in range(0, width, PIXELS):
-            n = min(PIXELS, width - start)
-            _gather(x, y, z, summands, RECTIFIED, row, start, 2, n + 1, 1, patch)
-            for i in range(3):
-                source = patch[1 if i == 0 else 0]
-                for k in range(3):
-                    shift = 1 if k == 0 else 0
-                    multiply(source[shift : shift + n], weights[3 * i + k], m[3 * i + k, :n])
-            for j in range(n):
-                left = 2 * (start + j)
-                for c in range(len(bias)):
-                    out[2 * row, left, c] = bias[c] + m[4, j, c]
-                    out[2 * row, left + 1, c] = bias[c] + (m[3, j, c] + m[5, j, c])
-                    out[2 * row + 1, left, c] = bias[c] + (m[1, j, c] + m[7, j, c])
-                    corners = (m[0, j, c] + m[2, j, c]) + (m[6, j, c] + m[8, j, c])
-                    out[2 * row + 1, left + 1, c] = bias[c] + corners
-
-
 def stem_weights(weight: Tensor) -> Float:
     """Weights (O, K, 3, 3) of few inputs -> (9 K, O') for `convolve_stem`."""
     return with_whole_lanes(weight.detach().permute(1, 2, 3, 0).flatten(0, 2).numpy())
-
-
-def quarter_weights(weight: Tensor) -> Float:
-    """Weights (O, I, 2, 2) -> (2, 2 I, O') for `quarter`."""
-    return with_whole_lanes(weight.detach().permute(2, 3, 1, 0).flatten(1, 2).numpy())
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def quarter(first, last, pairs, weights, bias, out):  # type: ignore[no-untyped-def]
-    """Rows first..last of out (H/2, W/2, O): x convolved by 2x2 with stride 2, plus bias.
-
-    pairs  (H/2, 2, W/2, 2 I), a view of x (H, W, I): the two pixels of a row that belong together lie together
-    """
-    m = np.empty((2, PIXELS, weights.shape[2]), np.float32)
-    for row in range(first, last):
-        for start in range(0, out.shape[1], PIXELS):
-            n = min(PIXELS, out.shape[1] - start)
-            for i in range(2):
-                multiply(pairs[row, i, start : start + n], weights[i], m[i, :n])
-            for j in range(n):
-                for c in range(len(bias)):
-                    out[row, start + j, c] = bias[c] + (m[0, j, c] + m[1, j, c])
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def lift(first, last, x, weights, bias, skip, out):  # type: ignore[no-untyped-def]
-    """Rows first..last of x (h, w, I) -> two rows each of out (2h, 2w, O): weights (I, O'), bias, each pixel repeated
-    2x2, plus skip."""
-    m = np.empty((PIXELS, weights.shape[1]), np.float32)
-    for row in range(first, last):
-        for start in range(0, x.shape[1], PIXELS):
-            n = min(PIXELS, x.shape[1] - start)
-            multiply(x[row, start : start + n], weights, m[:n])
-            for y in range(2 * row, 2 * row + 2):
-                for j in range(2 * n):
-                    column = 2 * start + j
-                    for c in range(len(bias)):
-                        out[y, column, c] = skip[y, column, c] + (m[j // 2, c] + bias[c])
-
-
-def head_weights(weight: Tensor) -> Float:
-    """Weights (O, I, 3, 3) of few outputs -> (I, 9 O, with whole lanes) for `convolve_head`."""
-    return with_whole_lanes(weight.detach().permute(1, 2, 3, 0).flatten(1).numpy())
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def convolve_head(first, last, x, weights, bias, out):  # type: ignore[no-untyped-def]
-    """Rows first..last of planes out (O, H, W): relu(x), (H, W, I), convolved to few channels, plus bias.
-
-    All nine taps of a row are one product; the rows above and below are kept.
-    """
-    height, width, inputs = x.shape
-    kinds = out.shape[0]
-    patch = np.empty((1, PIXELS, inputs), np.float32)
-    m = np.empty((PIXELS, weights.shape[1]), np.float32)
-    rows = np.zeros((3, width + 2, weights.shape[1]), np.float32)
-    for row in range(first - 1, last + 1):
-        kept = rows[(row + 3) % 3]
-        if row < 0 or row >= height:
-            kept[:] = _ZERO
-        else:
-            for start in range(0, width, PIXELS):
-                n = min(PIXELS, width - start)
-                _gather(x, x, x, 1, RECTIFIED, row, start, 1, n, 1, patch)
-                multiply(patch[0, :n], weights, m[:n])
-                kept[1 + start : 1 + start + n] = m[:n]
-        if row <= first:
-            continue
-        for k in range(kinds):
-            for column in range(width):
-                total = bias[k]
-                for i in range(3):
-                    taps = rows[(row - 2 + i + 3) % 3]
-                    for j in range(3):
-                        total += taps[column + j, (3 * i + j) * kinds + k]
-                out[k, row - 1, column] = total

@@ -7,10 +7,10 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from completion.cpu import winograd
+from completion.cpu import strided, winograd
 from completion.cpu.hourglass import hourglass_forward
+from completion.cpu.patches import COARSER, LINEAR, NOTHING, RECTIFIED, SAME, Added, Layer, Summands
 from completion.cpu.pixel_unet import PixelUNetKernels
-from completion.cpu.winograd import COARSER, LINEAR, NOTHING, RECTIFIED, SAME
 from completion.models import build_model, default_spec
 from tests.completion.scenes import street
 
@@ -31,14 +31,15 @@ def test_convolution_is_torchs(inputs: int, outputs: int, size: tuple[int, int])
     coarse = maps(outputs, (size[0] + 1) // 2, (size[1] + 1) // 2)
     same = maps(outputs, *size, seed=9)
     enlarged = F.interpolate(coarse, size=size, mode="bilinear", align_corners=True)
-    prepared = winograd.winograd_weights(weight), bias.numpy()
+    prepared = Layer(winograd.winograd_weights(weight), bias.numpy())
     for summands in (1, 2, 3):
         for least, kind, other in ((RECTIFIED, COARSER, coarse), (LINEAR, SAME, same), (LINEAR, NOTHING, same)):
             x = sum(parts[:summands], torch.zeros(()))
             plain = F.conv2d((F.relu(x) if least == 0 else x).double(), weight.double(), bias.double(), padding=1)
             expected = plain + {COARSER: enlarged, SAME: same, NOTHING: torch.zeros(())}[kind]
             found = np.full((*size, outputs), np.nan, np.float32)
-            common = *map(last, parts), summands, least, *prepared, last(other), kind, found
+            given = Summands.of(tuple(map(last, parts[:summands])), least)
+            common = given, prepared, Added(last(other), kind), found
             middle = (size[0] + 3) // 8
             winograd.convolve(0, middle, *common)
             winograd.convolve(middle, (size[0] + 3) // 4, *common)
@@ -49,18 +50,19 @@ def test_strides_and_heads_are_torchs() -> None:
     x, weight, bias = maps(32, 10, 70), torch.randn(32, 32, 3, 3) / 17, torch.randn(32)
     rectified = F.relu(x)
     half = np.empty((5, 35, 32), np.float32)
-    winograd.halve(0, 5, last(x), winograd.tap_weights(weight), bias.numpy(), half)
+    strided.halve(0, 5, last(x), Layer(strided.tap_weights(weight), bias.numpy()), half)
     assert np.abs(half - last(F.conv2d(rectified, weight, bias, stride=2, padding=1))).max() < 1e-5
 
     twice = np.empty((20, 140, 32), np.float32)
-    prepared = winograd.tap_weights(weight, transposed=True)
-    winograd.double(0, 10, last(x), last(x), last(x), 1, prepared, bias.numpy(), twice)
+    prepared = Layer(strided.tap_weights(weight, transposed=True), bias.numpy())
+    strided.double(0, 10, Summands.of((last(x),)), prepared, twice)
     expected = F.conv_transpose2d(rectified, weight, bias, stride=2, padding=1, output_padding=1)
     assert np.abs(twice - last(expected)).max() < 1e-5
 
     planes = np.empty((3, 10, 70), np.float32)
+    head = Layer(strided.head_weights(weight[:3]), bias[:3].numpy())
     for rows in ((0, 4), (4, 10)):
-        winograd.convolve_head(*rows, last(x), winograd.head_weights(weight[:3]), bias[:3].numpy(), planes)
+        strided.convolve_head(*rows, last(x), head, planes)
     assert np.abs(planes - F.conv2d(rectified, weight[:3], bias[:3], padding=1)[0].numpy()).max() < 1e-5
 
 
