@@ -128,14 +128,14 @@ class Candidates(NamedTuple):
 
 
 @njit(inline="always")
-def _distribution(weights, depths, cumulated, found, y, start, candidates):  # type: ignore[no-untyped-def]
+def _distribution(weights, depths, cumulated, found, logs, y, start, shifts, residual, shares):  # type: ignore[no-untyped-def]
     """Logits and corrections of a run of pixels -> weights, log depths, and found (4, n): log depth of foreground,
     median and background, weight of the foreground."""
-    _candidates(candidates.logs, y, start, candidates.shifts, candidates.residual, depths)
+    _candidates(logs, y, start, shifts, residual, depths)
     _softmax(weights, found[0])
     _cumulate(weights, depths, cumulated)
     for s in range(3):
-        _quantile(depths, cumulated, candidates.shares[s], found[s])
+        _quantile(depths, cumulated, shares[s], found[s])
     found[3] = _ZERO
     for k in range(CANDIDATES):
         for i in range(RUN):
@@ -170,11 +170,12 @@ def _read_rows(first, last, head, candidates, expected, out):  # type: ignore[no
     """
     weights, depths = np.zeros((CANDIDATES, RUN), np.float32), np.zeros((CANDIDATES, RUN), np.float32)
     cumulated, found = np.empty((CANDIDATES, RUN), np.float32), np.empty((4, RUN), np.float32)
-    top, width = candidates.top, candidates.logs.shape[2]
+    logs, top, shifts, residual, shares = candidates  # once: a field read in the loops costs 4 % of a frame
+    width = logs.shape[2]
     for y in range(first, last):
         for start in range(0, out.shape[2], RUN):
             _gather(head, y + top, start, min(RUN, width - start), weights, depths)
-            _distribution(weights, depths, cumulated, found, y + top, start, candidates)
+            _distribution(weights, depths, cumulated, found, logs, y + top, start, shifts, residual, shares)
             _write_run(weights, depths, cumulated, found, expected, y, start, out)
 
 
@@ -189,7 +190,8 @@ def _read_features(first, last, features, head_layer, candidates, expected, out)
     rectified = np.empty((RUN // 2, features.shape[2]), np.float32)
     head = np.empty((RUN // 2, 4 * CANDIDATES), np.float32)
     kernels, bias = head_layer
-    top, width = candidates.top, candidates.logs.shape[2]
+    logs, top, shifts, residual, shares = candidates  # once: a field read in the loops costs 4 % of a frame
+    width = logs.shape[2]
     for y in range(first, last):
         source, side = (y + top) // 2, (y + top) % 2
         for start in range(0, out.shape[2], RUN):
@@ -201,7 +203,7 @@ def _read_features(first, last, features, head_layer, candidates, expected, out)
                     for i in range(count):
                         weights[k, 2 * i + c] = head[i, a] + bias[side, a]
                         depths[k, 2 * i + c] = head[i, b] + bias[side, b]
-            _distribution(weights, depths, cumulated, found, y + top, start, candidates)
+            _distribution(weights, depths, cumulated, found, logs, y + top, start, shifts, residual, shares)
             _write_run(weights, depths, cumulated, found, expected, y, start, out)
 
 
