@@ -39,6 +39,7 @@ class Part:
 
 PARTS = (
     Part("Completion networks", ("completion",), ("--quick", "--repeats", "1")),
+    Part("NLSPN", ("nlspn",), ("--quick", "--repeats", "1")),
     Part("Point-cloud stage", ("pointcloud",), ("--repeats", "1"), "1"),
     Part("Point operations", ("ops", "--threads", "1", "--repeats", "7"), ("--repeats", "1"), "1"),
     Part("PointRCNN2 forward", ("detector_profile", "--preset", "pointrcnn2", "--threads", "2"), ("--preset", "small")),

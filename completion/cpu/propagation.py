@@ -1,7 +1,7 @@
 """The deformable operations of NLSPN (`completion.models.deformable`) for inference on the CPU: the same, faster.
 
-The torch version reads an index and a factor for each of the 32 corners of a pixel from memory in every iteration; here
-a row's positions are computed anew from 16 offsets.
+All iterations read the same pixels with the same factors. They are laid out once in the order in which an iteration
+reads them: all neighbours of a pixel in a row, so that its sum stays in registers.
 """
 
 from __future__ import annotations
@@ -23,61 +23,79 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 @njit(inline="always")
-def _add_samples(values, stride, size, corner, offset, weight, out):  # type: ignore[no-untyped-def]
-    """out (W,) += weight (W,) times the bilinear sample of a bordered flat map at corner + (0, x) + offset (2, W).
-
-    size  (H, W) as float32; corner  (row, column) of the first sample's place as float32
-    """
-    height, width = size
-    row, column = corner
-    for x in range(len(out)):
-        # A NaN fails both comparisons and ends at the border, where all is 0.
-        y = min(max(row + offset[0, x], -_ONE), height)
-        z = min(max(column + np.float32(x) + offset[1, x], -_ONE), width)
-        y = y if y >= -_ONE else -_ONE
-        z = z if z >= -_ONE else -_ONE
-        top, left = np.floor(y), np.floor(z)
-        down, right = y - top, z - left
-        first = np.uint32((np.int32(top) + np.int32(1)) * stride + np.int32(left) + np.int32(1))
-        below = np.uint32(first + np.uint32(stride))
-        upper = values[first] * (_ONE - right) + values[np.uint32(first + np.uint32(1))] * right
-        lower = values[below] * (_ONE - right) + values[np.uint32(below + np.uint32(1))] * right
-        out[x] += weight[x] * (upper * (_ONE - down) + lower * down)
+def _place(position, limit):  # type: ignore[no-untyped-def]
+    """Row or column in a bordered map of the first of two pixels round a position, and the share of the second."""
+    # Farther out both pixels lie in the border, where all is 0.
+    if position < -_ONE:
+        position = -_ONE
+    if position > limit:
+        position = limit
+    low = np.floor(position)
+    # A NaN must not become an index; it reaches the output through its share.
+    return (np.int32(low) + np.int32(1) if low >= -_ONE else np.int32(0)), position - low
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _propagate_rows(first, last, values, kept, offsets, weights, out):  # type: ignore[no-untyped-def]
-    """Rows first..last of one iteration: bordered values (H + 3, W + 3) -> the inside of out.
+def _plan_rows(first, last, offsets, weights, corners, factors):  # type: ignore[no-untyped-def]
+    """Rows first..last of corners (H, W, n) and factors (H, 4, W, n) of the n = K^2 - 1 neighbours without the centre.
 
-    kept  (H, W); where it is > 0, out gets it in place of the iteration's value (for the next iteration)
+    corners  upper left of the four in a bordered flat map; factors  bilinear shares times the weights (K^2, H, W)
     """
     taps, height, width = weights.shape
-    kernel = int(np.sqrt(np.float64(taps)) + 0.5)
-    flat, stride = values.ravel(), np.int32(values.shape[1])
-    size = (np.float32(height), np.float32(width))
+    kernel, bottom, right = int(np.sqrt(np.float64(taps)) + 0.5), np.float32(height), np.float32(width)
     for y in range(first, last):
-        total = out[y + 1, 1 : width + 1]
+        for neighbour in range(taps - 1):
+            tap = neighbour + (1 if neighbour >= taps // 2 else 0)
+            row, column = np.float32(y + tap // kernel - kernel // 2), np.float32(tap % kernel - kernel // 2)
+            for x in range(width):
+                top, down = _place(row + offsets[tap, 0, y, x], bottom)
+                left, beside = _place(column + np.float32(x) + offsets[tap, 1, y, x], right)
+                lower = weights[tap, y, x] * down
+                upper = weights[tap, y, x] - lower
+                corners[y, x, neighbour] = top * (width + 3) + left
+                factors[y, 0, x, neighbour] = upper * (_ONE - beside)
+                factors[y, 1, x, neighbour] = upper * beside
+                factors[y, 2, x, neighbour] = lower * (_ONE - beside)
+                factors[y, 3, x, neighbour] = lower * beside
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+def _propagate_rows(first, last, values, centre, corners, factors, kept, out):  # type: ignore[no-untyped-def]
+    """Rows first..last of one iteration: bordered values (H + 3, W + 3) -> the inside of out.
+
+    centre  (H, W) weight of the pixel itself; corners, factors  see `_plan_rows`
+    kept    (H, W); where it is > 0, out gets it in place of the iteration's value (for the next iteration)
+    """
+    _, width, neighbours = corners.shape
+    flat, stride, one = values.ravel(), np.uint32(values.shape[1]), np.uint32(1)
+    for y in range(first, last):
         for x in range(width):
-            total[x] = weights[taps // 2, y, x] * values[y + 1, x + 1]
-        for tap in range(taps):
-            if tap != taps // 2:
-                corner = (np.float32(y + tap // kernel - kernel // 2), np.float32(tap % kernel - kernel // 2))
-                _add_samples(flat, stride, size, corner, offsets[tap, :, y], weights[tap, y], total)
-        for x in range(width):
-            total[x] = kept[y, x] if kept[y, x] > _ZERO else total[x]
+            total = centre[y, x] * values[y + 1, x + 1]
+            for n in range(neighbours):
+                upper = np.uint32(corners[y, x, n])
+                lower = np.uint32(upper + stride)
+                total += (
+                    factors[y, 0, x, n] * flat[upper]
+                    + factors[y, 1, x, n] * flat[np.uint32(upper + one)]
+                    + factors[y, 2, x, n] * flat[lower]
+                    + factors[y, 3, x, n] * flat[np.uint32(lower + one)]
+                )
+            out[y + 1, x + 1] = kept[y, x] if kept[y, x] > _ZERO else total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _confidence_rows(first, last, values, offsets, affinities, out):  # type: ignore[no-untyped-def]
     """Rows first..last of out (n, H, W) = affinities times bordered values at p + offset."""
     taps, height, width = affinities.shape
-    flat, stride = values.ravel(), np.int32(values.shape[1])
-    size = (np.float32(height), np.float32(width))
+    bottom, right = np.float32(height), np.float32(width)
     for y in range(first, last):
         for tap in range(taps):
-            out[tap, y] = _ZERO
-            corner = (np.float32(y), _ZERO)
-            _add_samples(flat, stride, size, corner, offsets[tap, :, y], affinities[tap, y], out[tap, y])
+            for x in range(width):
+                top, down = _place(np.float32(y) + offsets[tap, 0, y, x], bottom)
+                left, beside = _place(np.float32(x) + offsets[tap, 1, y, x], right)
+                upper = values[top, left] * (_ONE - beside) + values[top, left + 1] * beside
+                lower = values[top + 1, left] * (_ONE - beside) + values[top + 1, left + 1] * beside
+                out[tap, y, x] = affinities[tap, y, x] * (upper * (_ONE - down) + lower * down)
 
 
 def _bordered(values: Float) -> Float:
@@ -101,10 +119,12 @@ def propagated(
     if kept is not None:
         require("kept", kept, (height, width))
         depth = np.where(kept > 0, kept, depth)
+    corners, factors = np.empty((height, width, taps - 1), np.int32), np.empty((height, 4, width, taps - 1), np.float32)
+    threads.run(_plan_rows, height, offsets, weights, corners, factors)
     current, following = _bordered(depth), np.zeros((height + 3, width + 3), np.float32)
     for left in reversed(range(iterations)):
         replaced = nothing if kept is None or left == 0 else kept
-        threads.run(_propagate_rows, height, current, replaced, offsets, weights, following)
+        threads.run(_propagate_rows, height, current, weights[taps // 2], corners, factors, replaced, following)
         current, following = following, current
     return np.ascontiguousarray(current[1:-2, 1:-2])
 

@@ -70,6 +70,14 @@ def test_confidence_is_the_twins() -> None:
     np.testing.assert_allclose(fast, expected, rtol=1e-5, atol=1e-5)
 
 
+def test_a_neighbour_that_is_nowhere_spoils_its_own_pixel_only() -> None:
+    offsets, weights, depth = maps(1, 9, 2), maps(1, 9, seed=1), maps(1, 1, seed=2)
+    offsets[0, 3, 0, 2, 5] = torch.nan
+    spoilt = np.argwhere(np.isnan(propagate(depth, offsets, weights, 1)[-1][0, 0].numpy()))
+    fast = propagated(array(depth)[0], array(offsets), array(weights), 1, None, RowThreads(1))
+    assert spoilt.tolist() == np.argwhere(np.isnan(fast)).tolist() == [[2, 5]]
+
+
 def test_kernels_refuse_arrays_that_do_not_fit() -> None:
     depth, offsets, weights = array(maps(1, 1))[0], array(maps(1, 9, 2)), array(maps(1, 9))
     with pytest.raises(ValueError, match="offsets: expected float32 of shape"):
