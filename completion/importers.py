@@ -1,4 +1,4 @@
-"""Reading the published checkpoint files of TWISE, MSG-CHN, sparse-to-dense and NLSPN without running anything in them.
+"""Reading published checkpoint files (TWISE, MSG-CHN, sparse-to-dense, NLSPN, PENet) without running what is in them.
 
 These are pickles of PyTorch 0.4 to 1.3, legacy or zip; `auglidar_base.torch_pickle` reads them.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,10 @@ from auglidar_base.errors import CheckpointError, SettingsError
 from auglidar_base.torch_pickle import read_torch_pickle
 from completion.models import ModelSpec, build_model, default_spec
 from completion.nlspn_import import nlspn_spec
+from completion.penet_import import penet_spec, without_unused
 from completion.state_dicts import Match, fill, match
 
-ARCHITECTURES = ("twise", "twise_maxpool", "msg_chn", "msg_chn_wacv", "sparse_to_dense", "nlspn")
+ARCHITECTURES = ("twise", "twise_maxpool", "msg_chn", "msg_chn_wacv", "sparse_to_dense", "nlspn", "enet", "penet")
 
 
 def read_tensors(path: str | Path) -> dict[str, Tensor]:
@@ -80,7 +82,11 @@ SPECS: dict[str, Callable[[Mapping[str, Tensor]], ModelSpec]] = {
 
 
 # Those whose files leave more open than a name can say; the user's choices by name.
-ASKING: dict[str, Callable[[Mapping[str, Tensor], Mapping[str, object]], ModelSpec]] = {"nlspn": nlspn_spec}
+ASKING: dict[str, Callable[[Mapping[str, Tensor], Mapping[str, object]], ModelSpec]] = {
+    "nlspn": nlspn_spec,
+    "enet": partial(penet_spec, "enet"),
+    "penet": partial(penet_spec, "penet"),
+}
 
 
 def _spec(architecture: str, tensors: Mapping[str, Tensor], choices: Mapping[str, object]) -> ModelSpec:
@@ -98,6 +104,8 @@ def _prepare(
     if architecture not in ARCHITECTURES:
         raise ValueError(f"architecture: expected one of {', '.join(ARCHITECTURES)}, got {architecture!r}")
     tensors = read_tensors(path)
+    if architecture == "penet":
+        tensors = without_unused(tensors)
     spec = _spec(architecture, tensors, choices)
     with torch.random.fork_rng(devices=[]):
         model = build_model(spec)
@@ -124,6 +132,8 @@ def import_checkpoint(path: str | Path, architecture: str, **choices: object) ->
         "sparse_to_dense"          model(sparse in m, rgb in 0..255) -> metres, never below 0.9 m in evaluation mode
         "nlspn"                    model(sparse in m, rgb standardised) -> metres >= 0; the choices legacy=..., and
                                    preserve_input=... must be given, see `nlspn_import.nlspn_spec`
+        "enet", "penet"            model(sparse in m, rgb in 0..255, position, K) -> (metres, ...), see `models.enet`;
+                                   crop="bottom" or "top_left" and camera="published" or "frame" may be chosen
     Width and depth are taken from the tensors. CheckpointError when the file is refused or does not fit,
     SettingsError when a choice is missing or is none of the architecture's.
     """

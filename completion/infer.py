@@ -20,6 +20,8 @@ from completion.executors import Executor
 from completion.models import ModelSpec
 from completion.models.classical import ClassicalCompleter
 from completion.types import CompletedDepth, DepthFrame, FloatMap
+from completion.windows import ARCHITECTURES as WINDOWED
+from completion.windows import WindowCompleter
 
 
 class Completer(Protocol):
@@ -59,12 +61,14 @@ def network_completer(
     device: str | torch.device = "cpu",
     decoding: str = "fused",
     rows: int | None = None,
-) -> NetworkCompleter:
+) -> Completer:
     """The completer of a network, computed by torch on one device; the network is moved there and set to `eval`.
 
     decoding  see `completion.decoding`; ValueError for one that the network does not offer
-    rows      see `NetworkCompleter`
+    rows      see `NetworkCompleter`; ENet and PENet see the window of `completion.windows` in any case
     """
+    if spec.architecture in WINDOWED:
+        return WindowCompleter(model, spec, device, decoding)
     return NetworkCompleter(torch_executor(model, spec, device, decoding), rows)
 
 
@@ -79,4 +83,8 @@ def load_completer(path_or_name: str | Path, device: str = "cpu", backend: str =
     if str(path_or_name) == "classical":
         return ClassicalCompleter()
     model, card = load_checkpoint(path_or_name)
+    if card.model.architecture in WINDOWED:
+        if backend not in ("torch", "auto"):
+            raise ValueError(f"backend {backend!r} does not run {card.model.architecture}; use backend 'torch'")
+        return network_completer(model, card.model, device, card.decoding)
     return NetworkCompleter(choose_executor(model, card, device, backend))

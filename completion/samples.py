@@ -17,6 +17,7 @@ from torch import Tensor
 
 from auglidar_base.errors import SettingsError
 from completion.types import DepthFrame, FloatMap
+from completion.windows import window_corner, window_intrinsics
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +60,28 @@ class Augmentation:
     edge_crops: float = 0.0
 
 
+class Crop(NamedTuple):
+    """Sparse (h, w), RGB (h, w, 3), target (h, w), and where they lie in the window of `completion.windows`.
+
+    place  row and column of the crop in the window at the frame's bottom centre; neither is flipped with the crop
+    K      (3, 3) in pixels of the window, NaN when the frame has none
+    """
+
+    sparse: FloatMap
+    image: NDArray[np.uint8]
+    target: FloatMap
+    place: tuple[int, int]
+    K: NDArray[np.float32]
+
+
 class Batch(NamedTuple):
-    """Sparse and target (B, 1, h, w) float32 metres, rgb (B, 3, h, w) uint8."""
+    """Sparse and target (B, 1, h, w) float32 metres, rgb (B, 3, h, w) uint8, place (B, 2) and K (B, 3, 3) of `Crop`."""
 
     sparse: Tensor
     rgb: Tensor
     target: Tensor
+    place: Tensor
+    K: Tensor
 
 
 def _corner(frame: DepthFrame, augmentation: Augmentation, rng: np.random.Generator) -> tuple[int, int, int, int]:
@@ -117,6 +134,12 @@ def draw_crop(
     sample: DepthFrame | TrainingSample, augmentation: Augmentation, rng: np.random.Generator
 ) -> tuple[FloatMap, NDArray[np.uint8], FloatMap]:
     """Sparse (h, w), RGB (h, w, 3) and target (h, w) of one augmented crop. SettingsError without a target."""
+    crop = placed_crop(sample, augmentation, rng)
+    return crop.sparse, crop.image, crop.target
+
+
+def placed_crop(sample: DepthFrame | TrainingSample, augmentation: Augmentation, rng: np.random.Generator) -> Crop:
+    """An augmented crop and its place. SettingsError without a target."""
     if isinstance(sample, DepthFrame):
         sample = TrainingSample(sample)
     frame = sample.frame
@@ -134,7 +157,15 @@ def draw_crop(
     image = disturb_image(image, augmentation, rng)
     if rng.random() < augmentation.flip:
         sparse, target, image = sparse[:, ::-1], target[:, ::-1], image[:, ::-1]
-    return np.ascontiguousarray(sparse, np.float32), np.ascontiguousarray(image), np.ascontiguousarray(target)
+    corner = window_corner(frame.size, "bottom")
+    K = np.full((3, 3), np.nan) if frame.K is None else window_intrinsics(frame.K, corner, "frame")
+    return Crop(
+        np.ascontiguousarray(sparse, np.float32),
+        np.ascontiguousarray(image),
+        np.ascontiguousarray(target),
+        (top - corner[0], left - corner[1]),
+        K.astype(np.float32),
+    )
 
 
 class StepBatches:
@@ -182,17 +213,19 @@ class StepBatches:
             if slot % self.crops_per_frame == 0:
                 position = step * self.frames_per_step + slot // self.crops_per_frame
                 sample = self.source[self._index(position)]
-            crops.append(draw_crop(sample, self.augmentation, np.random.default_rng((self.seed, 1, step, slot))))
+            crops.append(placed_crop(sample, self.augmentation, np.random.default_rng((self.seed, 1, step, slot))))
         micro = [crops[i : i + self.batch] for i in range(0, own, self.batch)]
         return [self._stack(part) for part in micro]
 
     @staticmethod
-    def _stack(crops: list[tuple[FloatMap, NDArray[np.uint8], FloatMap]]) -> Batch:
-        sizes = {sparse.shape for sparse, _, _ in crops}
+    def _stack(crops: list[Crop]) -> Batch:
+        sizes = {crop.sparse.shape for crop in crops}
         if len(sizes) != 1:
             raise SettingsError(f"frames of a batch differ in size {sorted(sizes)}; set a crop or batch_size = 1")
         return Batch(
-            torch.from_numpy(np.stack([sparse for sparse, _, _ in crops]))[:, None],
-            torch.from_numpy(np.stack([image for _, image, _ in crops])).permute(0, 3, 1, 2).contiguous(),
-            torch.from_numpy(np.stack([target for _, _, target in crops]))[:, None],
+            torch.from_numpy(np.stack([crop.sparse for crop in crops]))[:, None],
+            torch.from_numpy(np.stack([crop.image for crop in crops])).permute(0, 3, 1, 2).contiguous(),
+            torch.from_numpy(np.stack([crop.target for crop in crops]))[:, None],
+            torch.tensor([crop.place for crop in crops]),
+            torch.from_numpy(np.stack([crop.K for crop in crops])),
         )

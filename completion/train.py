@@ -26,7 +26,7 @@ from completion.checkpoints import Card, load_checkpoint, save_checkpoint
 from completion.decoding import default_decoding
 from completion.diagnostics import diagnose
 from completion.growth import adopt, grow
-from completion.infer import NetworkCompleter, network_completer
+from completion.infer import Completer, network_completer
 from completion.inputs import scale_rgb
 from completion.models import build_model
 from completion.resume import load_state, save_state
@@ -35,6 +35,7 @@ from completion.train_settings import PRECISIONS, TrainSettings, learning_rate, 
 from completion.training_log import append_row, keep_rows, show_in_tensorboard
 from completion.training_loss import training_loss
 from completion.types import DepthFrame
+from completion.windows import batch_view
 
 __all__ = ["TrainProgress", "TrainSettings", "learning_rate", "scales_at", "train"]
 
@@ -208,11 +209,11 @@ class _Run:
 
     def _loss(self, step: int, batch: Batch) -> dict[str, Tensor]:
         settings, spec = self.settings, self.settings.model
-        sparse, rgb, target = (part.to(self.device, non_blocking=True) for part in batch)
+        sparse, rgb, target, place, K = (part.to(self.device, non_blocking=True) for part in batch)
         colours = scale_rgb(rgb, spec.rgb).contiguous(memory_format=torch.channels_last)
         kind = PRECISIONS[settings.precision]
         with torch.autocast(self.device.type, dtype=kind, enabled=kind is not None):
-            outputs = self.forward(sparse / spec.depth_unit, colours)
+            outputs = self.forward(sparse / spec.depth_unit, colours, *batch_view(spec, sparse, place, K))
         return training_loss(
             outputs if isinstance(outputs, tuple) else (outputs,),
             sparse,
@@ -273,7 +274,7 @@ class _Run:
     def decoding(self) -> str:
         return self.settings.decoding or default_decoding(self.settings.model)
 
-    def _completer(self) -> NetworkCompleter:
+    def _completer(self) -> Completer:
         return network_completer(self.model, self.settings.model, self.device, self.decoding)
 
     def _card(self, step: int, facts: dict[str, Any]) -> Card:

@@ -12,8 +12,10 @@ from torch import nn
 from auglidar_base.errors import SettingsError
 from completion.depth_coefficients import Bins
 from completion.models.coefficients import CoefficientNetwork, CoefficientSparseToDense
+from completion.models.enet import ENet
 from completion.models.hourglass import MultiStack, Twise
 from completion.models.nlspn import NLSPN
+from completion.models.penet import PENet
 from completion.models.ring_coefficients import RingCoefficients
 from completion.models.selection import Selection
 from completion.models.sparse_to_dense import SparseToDense, TwinSparseToDense
@@ -88,6 +90,8 @@ MODELS: dict[str, Entry] = {
     ),
     "resnet_dc_to_dc": Entry(CoefficientSparseToDense, 1.0, "unit", "coefficients", 16),
     "ring_coefficients": Entry(RingCoefficients, 1.0, "standardised", "coefficients", 32),
+    "enet": Entry(ENet, 1.0, "raw", "depth", 32),
+    "penet": Entry(PENet, 1.0, "raw", "depth", 32),
     "nlspn": Entry(NLSPN, 1.0, "standardised", "depth", 1),
     "selection": Entry(Selection, 1.0, "standardised", "mixture", 32),
 }

@@ -45,7 +45,9 @@ def thinned_cloud(
         return points
     from pipeline.pointcloud.augment import augment_frame
 
-    completed = completer.complete(project_points(points, frame.calibration, frame.image_size), frame.image)
+    completed = completer.complete(
+        project_points(points, frame.calibration, frame.image_size), frame.image, frame.calibration.K
+    )
     completed = with_sigma(completed, settings)
     augment_seed = derive_seed(seed, frame.id, "augment")
     return augment_frame(completed, points, frame.calibration, settings, None, augment_seed).points

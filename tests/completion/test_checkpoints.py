@@ -31,7 +31,7 @@ def test_round_trip(saved: Path) -> None:
 
 @pytest.mark.parametrize("architecture", sorted(MODELS))
 def test_every_architecture_can_be_saved_and_rebuilt(tmp_path: Path, architecture: str) -> None:
-    spec = default_spec(architecture)
+    spec = default_spec(architecture, **({"width": 4} if architecture in ("enet", "penet") else {}))
     model, card = load_checkpoint(save_checkpoint(tmp_path / "any", build_model(spec), Card(spec)))
     assert card.model == spec
     assert sum(p.numel() for p in model.parameters()) > 0

@@ -18,7 +18,12 @@ from completion.train import TrainSettings, train
 from completion.training_loss import LossSettings, default_kind
 from tests.completion.scenes import Streets, street
 
-ARGUMENTS = {"twise": {"channels": 4}, "selection": {"width": 8}, "nlspn": {"layers": 18, "width": 4, "iterations": 2}}
+ARGUMENTS = {
+    "twise": {"channels": 4},
+    "selection": {"width": 8},
+    "nlspn": {"layers": 18, "width": 4, "iterations": 2},
+    "penet": {"width": 2},
+}
 
 
 class Mortal(Streets):
