@@ -1,15 +1,20 @@
 """Which executor computes a network: torch, kernels of our own, or an export in ONNX Runtime or OpenVINO.
 
-Exports are kept in the user's cache folder ($XDG_CACHE_HOME/auglidar, ~/.cache/auglidar) under the SHA-256 of their
-weights; any image size fits one file. Deleting them is always safe.
+Exports are kept in the user's cache folder ($XDG_CACHE_HOME/auglidar, ~/.cache/auglidar) under a hash of all that
+shapes them (`export_key`); any image size fits one file. Deleting them is always safe.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -34,8 +39,8 @@ BACKENDS = ("torch", "numba", "onnxruntime", "openvino", "auto")
 EXPORTABLE = ("selection", "twise", "msg_chn")
 OWN_KERNELS = (*EXPORTABLE, "ring_coefficients", "nlspn")
 OPSET = 17
-# Part of the file names: raise it when the exported part of a network changes.
-EXPORT_VERSION = 1
+# Those whose versions an export depends on: who writes the graph, and who reads it.
+EXPORTERS = ("torch", "onnx", "onnxruntime", "openvino")
 
 # The inputs of an exported graph -> its output.
 Session = Callable[[Sequence[Tensor]], Tensor]
@@ -120,9 +125,34 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "auglidar"
 
 
+def export_key(card: Card) -> str:
+    """Hash of everything that shapes an export: network with arguments, weights, decoding, our code, and versions.
+
+    Weights alone do not tell: TWISE with average and with maximum pooling have the same tensors.
+    """
+    versions = {package: _version(package) for package in EXPORTERS}
+    shaping = [asdict(card.model), card.decoding, card.sha256, _source_hash(), OPSET, versions]
+    return hashlib.sha256(json.dumps(shaping, sort_keys=True, default=str).encode()).hexdigest()[:32]
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
+
+
+@cache
+def _source_hash() -> str:
+    """Of the networks' code and this file, so that a changed forward pass is exported anew."""
+    here = Path(__file__).resolve()
+    files = [here, *sorted((here.parent / "models").glob("*.py"))]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+
+
 def exported(model: nn.Module, card: Card) -> bytes:
-    """The ONNX graph of a network's convolutions, from the cache when these weights were exported before."""
-    path = cache_folder() / f"{card.model.architecture}-{card.sha256[:32]}-{EXPORT_VERSION}.onnx"
+    """The ONNX graph of a network's convolutions, from the cache when this network was exported before."""
+    path = cache_folder() / f"{card.model.architecture}-{export_key(card)}.onnx"
     if card.sha256 and path.is_file():
         return path.read_bytes()
     graph = export_onnx(model)

@@ -37,6 +37,8 @@ __all__ = [
 
 FORMAT = "auglidar-completion-1"
 WEIGHTS = Path(__file__).resolve().parent / "weights"
+# Names of tensors in files of earlier versions -> their names now.
+_EARLIER = {"convtf.weight": "convtf.0.weight", "convtf.bias": "convtf.0.bias"}
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ def load_checkpoint(path_or_name: str | Path) -> tuple[nn.Module, Card]:
             "the file is damaged or not this card's"
         )
     try:
-        tensors = load_tensors(content)
+        tensors = {_EARLIER.get(name, name): value for name, value in load_tensors(content).items()}
     except SafetensorError as error:
         raise CheckpointError(f"{weights_path}: not a readable safetensors file: {error}") from error
     model = _fitting_model(card.model, tensors, weights_path)

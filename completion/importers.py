@@ -116,6 +116,20 @@ def _prepare(
     return model, spec, tensors
 
 
+def fitting_architectures(tensors: Mapping[str, Tensor]) -> tuple[str, ...]:
+    """The architectures whose networks have exactly these tensors; those that must be asked for choices left out."""
+    found = []
+    for architecture, spec in SPECS.items():
+        try:
+            with torch.device("meta"):
+                compared = match(build_model(spec(tensors)), tensors)
+        except (CheckpointError, SettingsError, RuntimeError):
+            continue  # Its sizes cannot be read from these tensors, so it is another network.
+        counters_only = all(name.endswith("num_batches_tracked") for name in compared.missing)
+        found += [architecture] * (counters_only and not compared.unknown and not compared.misshapen)
+    return tuple(found)
+
+
 def compare_checkpoint(path: str | Path, architecture: str, **choices: object) -> Match:
     """Which tensors of the file match the architecture and which do not. CheckpointError for an unreadable file."""
     model, _, tensors = _prepare(path, architecture, choices)
@@ -145,7 +159,11 @@ def import_with_spec(
 ) -> tuple[nn.Module, ModelSpec, dict[str, Any]]:
     """As `import_checkpoint`, with the network's input scaling and the facts for its card."""
     model, spec, tensors = _prepare(path, architecture, choices)
-    fill(model, tensors, f"{path} as {architecture!r}")
+    try:
+        fill(model, tensors, f"{path}: as {architecture!r}")
+    except CheckpointError as error:
+        others = fitting_architectures(read_tensors(path))
+        raise CheckpointError(f"{error}; it fits {' or '.join(others)}" if others else str(error)) from None
     facts: dict[str, Any] = {
         "imported_from": Path(path).name,
         "source_sha256": hashlib.sha256(Path(path).read_bytes()).hexdigest(),

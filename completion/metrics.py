@@ -29,7 +29,7 @@ DELTAS = {  # thresholds of max(p / g, g / p): the usual three and the finer set
 class Rules:
     """What one evaluation code counts.
 
-    smallest             target pixels are valid above this many metres (strictly)
+    smallest             target pixels are valid above this many metres (strictly, both as float32 like the codes')
     positive_prediction  MAE, RMSE and the like also need a prediction > 0 (msg_chn: drops the worst pixels)
     clamp_all            prediction clamped to [0, cap] and target to cap before everything (DC)
     clamp_deltas         the deltas see the prediction clamped to [0, cap] (TWISE: its clamp works in place)
@@ -81,7 +81,8 @@ def depth_metrics(
     p, g = np.asarray(prediction, np.float64), np.asarray(target, np.float64)
     if p.shape != g.shape:
         raise ValueError(f"prediction {p.shape} and target {g.shape} must have one shape")
-    valid = g > rule.smallest
+    # In float64 a float32 target of 0.1 m is greater than 0.1; the codes compare float32 with float32.
+    valid = np.asarray(target, np.float32) > np.float32(rule.smallest)
     if not valid.any():
         raise ValueError(f"no valid target pixel (rules {rules!r}: target > {rule.smallest} m)")
     p, g = p[valid], g[valid]

@@ -165,10 +165,26 @@ def import_with_report(path: str | Path, architecture: str) -> tuple[nn.Module, 
         raise CheckpointError(f"unknown architecture {architecture!r}; known are {', '.join(BUILDERS)}")
     tensors = read_tensors(path)
     try:
+        return _filled(tensors, architecture, path)
+    except CheckpointError as error:
+        others = [name for name in BUILDERS if name != architecture and _fits(tensors, name)]
+        raise CheckpointError(f"{error}; it fits {' or '.join(others)}" if others else str(error)) from None
+
+
+def _filled(tensors: Mapping[str, Tensor], architecture: str, path: str | Path) -> tuple[nn.Module, ImportReport]:
+    try:
         model = BUILDERS[architecture](tensors)
     except ValueError as error:
         raise CheckpointError(f"{path}: {error}") from error
     return model.eval(), fill(model, to_spconv2(tensors, model), path)
+
+
+def _fits(tensors: Mapping[str, Tensor], architecture: str) -> bool:
+    try:
+        _filled(tensors, architecture, architecture)
+    except CheckpointError:
+        return False
+    return True
 
 
 def import_checkpoint(path: str | Path, architecture: str) -> nn.Module:

@@ -74,18 +74,13 @@ def bin_box_loss(code: Tensor, targets: BinTargets, coder: BinCoder) -> BoxLoss:
     return BoxLoss(location, heading, F.smooth_l1_loss(size_res, targets.size_res))
 
 
-def consistency_loss(
-    logits: Tensor, code: Tensor, targets: BinTargets, sizes: Tensor, mean_sizes: Tensor, coder: BinCoder
-) -> Tensor:
-    """EPNet's consistency enforcing loss (sec. 3.4): mean of -log(max(c * IoU, 1e-4)) over R rows.
+def aligned_iou(code: Tensor, targets: BinTargets, sizes: Tensor, mean_sizes: Tensor, coder: BinCoder) -> Tensor:
+    """(R,) overlap of coded boxes and their targets as EPNet takes it (sec. 3.4), differentiable.
 
-    logits  (R,) classification logits, c = sigmoid, *not* detached
-    sizes   (R, 3) true h w l in metres      mean_sizes  (3,) or (R, 3)
-    The IoU is axis-aligned in the local frame: l along x, h along y, w along z, headings left out; the predicted x and
-    z are the expectations over the bins. Overlaps are clamped to 1e-3 per axis, the predicted volume to 1e-3.
+    sizes  (R, 3) true h w l in metres      mean_sizes  (3,) or (R, 3)
+    Axis-aligned in the local frame: l along x, h along y, w along z, headings left out; the predicted x and z are the
+    expectations over the bins. Overlaps are clamped to 1e-3 per axis, the predicted volume to 1e-3.
     """
-    if len(code) == 0:
-        return code.sum() * 0.0
     x_bin, z_bin, x_res, z_res, y, _, _, size_res = coder.split(code)
     predicted = torch.stack(
         [coder.expected_location(x_bin, x_res), y.squeeze(1), coder.expected_location(z_bin, z_res)], dim=1
@@ -101,8 +96,30 @@ def consistency_loss(
     lower = torch.maximum(predicted - half, true - true_half)
     shared = (upper - lower).clamp(min=1e-3).prod(dim=1)
     volume = predicted_size.prod(dim=1).clamp(min=1e-3)
-    iou = shared / (volume + sizes.prod(dim=1) - shared)
+    return shared / (volume + sizes.prod(dim=1) - shared)
+
+
+def consistency_loss(
+    logits: Tensor, code: Tensor, targets: BinTargets, sizes: Tensor, mean_sizes: Tensor, coder: BinCoder
+) -> Tensor:
+    """EPNet's consistency enforcing loss (sec. 3.4): mean of -log(max(c * IoU, 1e-4)) over R rows.
+
+    logits  (R,) classification logits, c = sigmoid, *not* detached; IoU and the other arguments: see `aligned_iou`
+    """
+    if len(code) == 0:
+        return code.sum() * 0.0
+    iou = aligned_iou(code, targets, sizes, mean_sizes, coder)
     return -(logits.sigmoid() * iou).clamp(min=1e-4).log().mean()
+
+
+def iou_branch_loss(raw: Tensor, iou: Tensor) -> Tensor:
+    """EPNet's IoU branch: binary cross entropy of its raw output (R,) against the detached IoU, both clamped.
+
+    No sigmoid: the output is clamped to [1e-4, 0.9999] like the IoU (R,), see `aligned_iou`.
+    """
+    if len(raw) == 0:
+        return raw.sum() * 0.0
+    return F.binary_cross_entropy(raw.clamp(1e-4, 0.9999), iou.detach().clamp(1e-4, 0.9999))
 
 
 def masked_bce(logits: Tensor, labels: Tensor) -> Tensor:

@@ -31,6 +31,15 @@ def _up(inputs: int, outputs: int, stride: int = 2) -> nn.Sequential:
     return _normalised(up, outputs)
 
 
+def grey_levels(rgb: Tensor) -> Tensor:
+    """RGB (B, 3, H, W) in 0..255 -> (B, 1, H, W) whole grey levels, as the reference reads them with Pillow.
+
+    Pillow's conversion to L, ITU-R 601 in 16-bit fixed point; float32 holds every sum below 2^24 exactly.
+    """
+    red, green, blue = rgb.round().unsqueeze(2).unbind(1)
+    return ((19595 * red + 38470 * green + 7471 * blue + 0x8000) / 0x10000).floor()
+
+
 class Backbone(nn.Module):
     """(B, D, H, W) depth and (B, 3 or 1, H, W) image -> (B, heads, H, W), H and W multiples of 16.
 
@@ -38,6 +47,8 @@ class Backbone(nn.Module):
     grey            the image is one grey channel (published "gd" models); both branches then have half the features
     width           features at full resolution (published: 64, a multiple of 4); every layer scales with it
     """
+
+    levels_per_unit: float = 255.0  # grey levels per unit of the image as `forward` takes it
 
     def __init__(
         self, layers: int, heads: int, depth_channels: int = 1, grey: bool = False, width: int = WIDTH
@@ -62,7 +73,8 @@ class Backbone(nn.Module):
         self.convt3 = _up(w2 + w4, w1)
         self.convt2 = _up(w1 + w2, w1)
         self.convt1 = _up(w1 + w1, w1, stride=1)
-        self.convtf = nn.Conv2d(w1 + w1, heads, 1)
+        # A container of one, as published: the files name it convtf.0.
+        self.convtf = nn.Sequential(nn.Conv2d(w1 + w1, heads, 1))
         self._initialise()
 
     def _initialise(self) -> None:
@@ -90,10 +102,8 @@ class Backbone(nn.Module):
         return head
 
     def colours(self, rgb: Tensor) -> Tensor:
-        """RGB (B, 3, H, W) as the image branch takes it: itself, or its luma (ITU-R 601)."""
-        if not self.grey:
-            return rgb
-        return 0.299 * rgb[:, 0:1] + 0.587 * rgb[:, 1:2] + 0.114 * rgb[:, 2:3]
+        """RGB (B, 3, H, W) as the image branch takes it: itself, or its grey level in the same unit."""
+        return grey_levels(rgb * self.levels_per_unit) / self.levels_per_unit if self.grey else rgb
 
 
 class SparseToDense(Backbone):
@@ -101,6 +111,8 @@ class SparseToDense(Backbone):
 
     In training mode 100 times the head; in evaluation mode relu(100 y - 0.9) + 0.9, so never below 0.9 m.
     """
+
+    levels_per_unit = 1.0
 
     def __init__(self, layers: int = 18, grey: bool = False, width: int = WIDTH) -> None:
         super().__init__(layers, heads=1, grey=grey, width=width)

@@ -6,17 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from detection.data_augmentation import augment_regions
-from detection.losses import bin_box_loss, consistency_loss, foreground_loss, masked_bce
+from detection.losses import aligned_iou, bin_box_loss, consistency_loss, foreground_loss, iou_branch_loss, masked_bce
 from detection.models.batch import PointBatch, RawDetections
 from detection.models.box_coding import MEAN_SIZES, boxes_from_points, boxes_from_rois, rotate_y, to_roi_frame
 from detection.models.proposals import Proposals, ProposalSettings, propose
-from detection.models.rcnn import RCNN, RCNNOutput
+from detection.models.rcnn import RCNN
 from detection.models.rpn import RPN, RPNOutput
-from detection.ops import iou_3d_aligned, roi_pool
+from detection.ops import roi_pool
 from detection.targets import RoiSamplingSettings, RoiTargets, classification_labels, point_labels, sample_rois
 
 POOLED_POINTS = 512
@@ -158,18 +157,9 @@ class PointRCNN(nn.Module):
             agreement = consistency_loss(logits[valid], code, targets, local[:, 3:6], self.mean_size, coder)
             losses["rcnn_consistency"] = self.settings.consistency_weight * agreement
         if out.iou is not None:
-            losses["rcnn_iou"] = self._iou_loss(out, rois.flatten(0, 1)[valid], truth.flatten(0, 1)[valid], valid)
+            overlap = aligned_iou(code, targets, local[:, 3:6], self.mean_size, coder)
+            losses["rcnn_iou"] = iou_branch_loss(out.iou.squeeze(1)[valid], overlap)
         return losses
-
-    def _iou_loss(self, out: RCNNOutput, rois: Tensor, truth: Tensor, valid: Tensor) -> Tensor:
-        """EPNet's IoU branch: binary cross entropy of its raw output (clamped, no sigmoid) against the refined IoU."""
-        assert out.iou is not None
-        if not bool(valid.any()):
-            return out.iou.sum() * 0.0
-        code = out.reg[valid].detach()
-        refined = boxes_from_rois(rois, code, self.rcnn_net.coder, self.mean_size, self.settings.soft_decoding)
-        iou = torch.as_tensor(iou_3d_aligned(refined, truth)).to(code).clamp(1e-4, 0.9999)
-        return F.binary_cross_entropy(out.iou.squeeze(1)[valid].clamp(1e-4, 0.9999), iou)
 
     @torch.no_grad()
     def raw_detections(self, batch: PointBatch) -> list[RawDetections]:

@@ -114,7 +114,8 @@ def import_weights(path: Path, architecture: str, out: Path, choices: Mapping[st
     except SettingsError as error:
         raise UsageError(str(error)) from None
     except CheckpointError as error:
-        raise DataError(path, f"a checkpoint of {architecture}", str(error)) from None
+        # The libraries name the file as well; once is enough.
+        raise DataError(path, f"a checkpoint of {architecture}", str(error).removeprefix(f"{path}: ")) from None
 
 
 def _import_backbone(path: Path, out: Path) -> Path:

@@ -109,3 +109,50 @@ def test_missing_packages_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(backends, "find_spec", lambda name: None if name == backend else real(name) or object())
     with pytest.raises(ImportError, match=rf"needs {backend}: pip install 'auglidar\["):
         load_completer(path, backend=backend)
+
+
+# Published variants with the same tensors: nothing but the card tells them apart.
+TWINS = {
+    "twise": ({"channels": 4, "pooling": "avg"}, {"channels": 4, "pooling": "max"}),
+    "msg_chn": ({"channels": 4, "extra_skips": True}, {"channels": 4, "extra_skips": False}),
+}
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
+@pytest.mark.parametrize("architecture", sorted(TWINS))
+def test_variants_with_the_same_weights_are_exported_apart(tmp_path: Path, architecture: str, backend: str) -> None:
+    for package in NEEDS[backend]:
+        pytest.importorskip(package)
+    frame, depths = street(1, 64, 96, row_step=3), []
+    weights = {}
+    for number, arguments in enumerate(TWINS[architecture]):
+        spec = default_spec(architecture, **arguments)
+        model = build_model(spec)
+        weights = weights or {name: value.clone() for name, value in model.state_dict().items()}
+        model.load_state_dict(weights)
+        path = save_checkpoint(tmp_path / f"variant{number}", model, Card(spec, default_decoding(spec)))
+        found = load_completer(path, backend=backend).complete(frame.sparse, frame.image).depth
+        assert np.abs(found - load_completer(path).complete(frame.sparse, frame.image).depth).max() < 1e-3
+        depths.append(found)
+    assert np.abs(depths[0] - depths[1]).max() > 2e-3
+
+
+@pytest.mark.parametrize("package", ["torch", "onnx", "onnxruntime", "openvino"])
+def test_another_exporter_exports_anew(monkeypatch: pytest.MonkeyPatch, package: str) -> None:
+    card = Card(default_spec("twise"), "fused", sha256="0" * 64)
+    before, real = backends.export_key(card), backends.version
+    monkeypatch.setattr(backends, "version", lambda name: "99.0" if name == package else real(name))
+    assert backends.export_key(card) != before
+
+
+def test_everything_of_a_card_that_shapes_the_graph_is_in_the_key() -> None:
+    spec = default_spec("twise")
+    cards = (
+        Card(spec, "fused", sha256="a"),
+        Card(spec, "mean", sha256="a"),
+        Card(spec, "fused", sha256="b"),
+        Card(default_spec("twise", pooling="max"), "fused", sha256="a"),
+        Card(default_spec("msg_chn"), "fused", sha256="a"),
+    )
+    assert len({backends.export_key(card) for card in cards}) == len(cards)
+    assert backends.export_key(Card(spec, "fused", {"seed": 1}, "a")) == backends.export_key(cards[0])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
+import json
 import os
 import sys
 import types
@@ -12,11 +14,21 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
+from safetensors.torch import save as save_tensors
 
-from completion.checkpoints import CheckpointError, convert_checkpoint, import_checkpoint, load_checkpoint
+from completion.checkpoints import (
+    Card,
+    CheckpointError,
+    convert_checkpoint,
+    import_checkpoint,
+    load_checkpoint,
+    save_checkpoint,
+)
 from completion.importers import compare_checkpoint
 from completion.models import build_model, default_spec
-from completion.models.sparse_to_dense import SparseToDense
+from completion.models.sparse_to_dense import SparseToDense, TwinSparseToDense, grey_levels
+from tests.completion import published_keys
 
 FORMATS = pytest.mark.parametrize("zipped", [True, False], ids=["zip", "legacy"])
 
@@ -173,3 +185,58 @@ def test_conversion_to_our_format(tmp_path: Path) -> None:
     assert len(card.training["source_sha256"]) == 64
     with torch.no_grad():
         assert torch.equal(converted(*example())[0], model(*example())[0])
+
+
+PUBLISHED = {
+    "twise": (published_keys.hourglasses(64, 3), 92),
+    "twise_maxpool": (published_keys.hourglasses(64, 3), 92),
+    "msg_chn": (published_keys.hourglasses(32, 1), 92),
+    "msg_chn_wacv": (published_keys.hourglasses(64, 1), 92),
+    "sparse_to_dense": (published_keys.sparse_to_dense(), 164),
+    "sparse_to_dense 34": (published_keys.sparse_to_dense((3, 4, 6, 3)), 260),
+    "sparse_to_dense gd": (published_keys.sparse_to_dense(grey=True), 164),
+}
+
+
+@pytest.mark.parametrize("name", sorted(PUBLISHED))
+def test_files_with_the_published_names_are_taken(tmp_path: Path, name: str) -> None:
+    shapes, count = PUBLISHED[name]
+    assert len(shapes) == count
+    given = published_keys.tensors(shapes)
+    imported = import_checkpoint(save(tmp_path / "public.pth.tar", {"model": given}, True), name.split()[0])
+    state = imported.state_dict()
+    assert {key: tuple(value.shape) for key, value in state.items()} == shapes
+    assert all(torch.equal(state[key], value) for key, value in given.items())
+
+
+def test_a_wrong_architecture_names_those_that_fit(tmp_path: Path) -> None:
+    path = save(tmp_path / "public.pth", {"model": published_keys.tensors(published_keys.hourglasses(4, 3))}, True)
+    with pytest.raises(CheckpointError, match=r"; it fits twise or twise_maxpool$") as caught:
+        import_checkpoint(path, "sparse_to_dense")
+    assert str(caught.value).count(str(path)) == 1
+    small = save(tmp_path / "other.pth", {"model": {"a.weight": torch.zeros(2)}}, True)
+    with pytest.raises(CheckpointError) as caught:
+        import_checkpoint(small, "twise")
+    assert "it fits" not in str(caught.value)
+
+
+def test_weights_saved_before_the_container_still_load(tmp_path: Path) -> None:
+    spec = default_spec("sparse_to_dense", width=4)
+    model = build_model(spec)
+    path = save_checkpoint(tmp_path / "ours", model, Card(spec, "fused"))
+    old = {name.replace("convtf.0.", "convtf."): value for name, value in model.state_dict().items()}
+    path.write_bytes(save_tensors(old))
+    card = json.loads(path.with_suffix(".json").read_text())
+    card["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    path.with_suffix(".json").write_text(json.dumps(card))
+    assert torch.equal(load_checkpoint(path)[0].convtf[0].weight, model.convtf[0].weight)
+
+
+def test_grey_is_pillows() -> None:
+    rgb = np.random.default_rng(3).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    expected = np.asarray(Image.fromarray(rgb).convert("L"), np.float32)
+    values = torch.from_numpy(rgb).permute(2, 0, 1)[None].float()
+    np.testing.assert_array_equal(grey_levels(values)[0, 0].numpy(), expected)
+    raw, unit = SparseToDense(grey=True, width=4), TwinSparseToDense(grey=True, width=4)
+    np.testing.assert_array_equal(raw.colours(values)[0, 0].numpy(), expected)
+    np.testing.assert_allclose(unit.colours(values / 255)[0, 0].numpy() * 255, expected, atol=1e-4)

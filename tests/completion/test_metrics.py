@@ -127,3 +127,12 @@ def test_wrong_input_is_named() -> None:
         depth_metrics(np.zeros((2, 3)), np.zeros((3, 2)))
     with pytest.raises(ValueError, match="no valid target"):
         depth_metrics(*maps((1.0, 0.0)))
+
+
+@pytest.mark.parametrize(("rules", "counted"), [("twise", 1), ("ma", 1), ("kitti", 2)])
+def test_a_float32_target_of_exactly_a_decimetre(rules: str, counted: int) -> None:
+    # float32(0.1) is greater than the float64 0.1, but the codes compare in float32.
+    target = np.array([[0.1, 10.0]], np.float32)
+    assert depth_metrics(target, target, rules)["valid_pixels"] == counted
+    above = np.array([[np.nextafter(np.float32(0.1), np.float32(1)), 10.0]], np.float32)
+    assert depth_metrics(above, above, rules)["valid_pixels"] == 2

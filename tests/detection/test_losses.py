@@ -9,11 +9,13 @@ import pytest
 import torch
 
 from detection.losses import (
+    aligned_iou,
     bin_box_loss,
     box_corners,
     consistency_loss,
     corner_loss,
     foreground_loss,
+    iou_branch_loss,
     masked_bce,
     sigmoid_focal,
     smooth_l1,
@@ -123,3 +125,23 @@ def test_corners_match_the_devkit_order() -> None:
 
     box = np.array([[2.0, 1.0, 15.0, 1.5, 1.6, 4.0, 0.3]])
     np.testing.assert_allclose(box_corners(torch.tensor(box)).numpy(), corners(Boxes3D(box)), atol=1e-12)
+
+
+def test_the_iou_branch_learns_the_aligned_iou_without_headings() -> None:
+    # A car 1 m off along x with a wrong heading: 3 x 1.5 x 2 m of 4 x 1.5 x 2 m shared, IoU 9 / (12 + 12 - 9) = 0.6.
+    coder = rcnn_coder()
+    mean = torch.tensor([1.5, 2.0, 4.0], dtype=torch.float64)
+    box = torch.tensor([[0.25, 0.0, 0.25, 1.5, 2.0, 4.0, 0.5]], dtype=torch.float64)
+    wrong = box + torch.tensor([[1.0, 0, 0, 0, 0, 0, -0.5]], dtype=torch.float64)
+    targets = coder.encode(box[:, :3], box[:, 3:6], box[:, 6], mean)
+    code = coder.perfect_code(coder.encode(wrong[:, :3], wrong[:, 3:6], wrong[:, 6], mean)).requires_grad_()
+    iou = aligned_iou(code, targets, box[:, 3:6], mean, coder)
+    assert iou.tolist() == pytest.approx([0.6])
+    raw = torch.tensor([0.25], dtype=torch.float64, requires_grad=True)
+    loss = iou_branch_loss(raw, iou)
+    assert loss.item() == pytest.approx(-0.6 * math.log(0.25) - 0.4 * math.log(0.75))
+    loss.backward()
+    assert raw.grad is not None
+    assert code.grad is None
+    # No sigmoid: what lies outside [1e-4, 0.9999] is clamped.
+    assert iou_branch_loss(raw.detach() - 3, iou).item() == pytest.approx(-0.6 * math.log(1e-4), rel=1e-3)
