@@ -56,5 +56,7 @@ def test_templates_ask_for_what_contributing_asks_for() -> None:
 def test_one_version_everywhere() -> None:
     (version,) = re.findall(r'^version = "([^"]+)"', PROJECT, re.MULTILINE)
     changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    alone = (ROOT / "packages" / "auglidar-eval" / "pyproject.toml").read_text(encoding="utf-8")
+    assert re.findall(r'^version = "([^"]+)"', alone, re.MULTILINE) == [version]
     assert version == pipeline.__version__ == str(read_yaml("CITATION.cff")["version"])
     assert re.findall(r"^## (\S+)", changelog, re.MULTILINE)[0] in (version, "Unreleased")

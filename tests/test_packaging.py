@@ -15,6 +15,7 @@ import sysconfig
 import tarfile
 import venv
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,15 @@ def copy_of_checkout(target: Path) -> Path:
     return target
 
 
+def wheel_from_sdist(source: Path, folder: Path) -> Path:
+    """The wheel built from the sdist, so that a file missing from either is missing here."""
+    sdist = build("sdist", source, folder)
+    with tarfile.open(sdist) as archive:
+        archive.extractall(folder / "unpacked", filter="data")
+    (unpacked,) = (folder / "unpacked").iterdir()
+    return build("wheel", unpacked, folder)
+
+
 def build(kind: str, source: Path, out: Path) -> Path:
     """An sdist or a wheel of the source tree, by the project's own build backend."""
     call = f"from setuptools import build_meta; print(build_meta.build_{kind}({str(out)!r}))"
@@ -55,13 +65,8 @@ def build(kind: str, source: Path, out: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel built from the sdist, so that a file missing from either is missing here."""
     folder = tmp_path_factory.mktemp("dist")
-    sdist = build("sdist", copy_of_checkout(folder / "checkout"), folder)
-    with tarfile.open(sdist) as archive:
-        archive.extractall(folder / "unpacked", filter="data")
-    (unpacked,) = (folder / "unpacked").iterdir()
-    return build("wheel", unpacked, folder)
+    return wheel_from_sdist(copy_of_checkout(folder / "checkout"), folder)
 
 
 @pytest.fixture(scope="module")
@@ -71,21 +76,30 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return install(wheel, folder)
 
 
-def install(what: Path, folder: Path) -> Path:
-    """A new environment with `what` (a wheel or a source tree) and borrowed dependencies; returns its bin folder."""
+def install(what: Path, folder: Path, borrowed: Sequence[str] = ()) -> Path:
+    """A new environment with `what` (a wheel or a source tree) and borrowed dependencies; returns its bin folder.
+
+    borrowed  folders of the site-packages at hand that are all it has; empty: everything there
+    """
     venv.create(folder, with_pip=False)
     site = Path(sysconfig.get_path("purelib", vars={"base": str(folder), "platbase": str(folder)}))
-    # A .pth file inside a borrowed folder is not read, so the editable installation there stays out of sight.
-    (site / "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n", encoding="utf-8")
+    here = Path(sysconfig.get_path("purelib"))
+    if borrowed:
+        for name in borrowed:
+            (site / name).symlink_to(here / name)
+    else:
+        # A .pth file inside a borrowed folder is not read, so the editable installation there stays out of sight.
+        (site / "borrowed.pth").write_text(f"{here}\n", encoding="utf-8")
     pip = [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python"), "--disable-pip-version-check"]
     options = ["install", "--quiet", "--no-deps", "--no-index", "--no-build-isolation", str(what)]
     subprocess.run([*pip, *options], check=True, capture_output=True)
     return folder / "bin"
 
 
-def call(installed: Path, folder: Path, *words: str) -> str:
+def call(installed: Path, folder: Path, *words: str, **variables: str) -> str:
     """Output of a command of the environment, run in `folder` without anything of this checkout on the path."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "AUGLIDAR"))}
+    environment |= variables
     done = subprocess.run(
         [installed / words[0], *words[1:]], cwd=folder, env=environment, capture_output=True, text=True, check=False
     )

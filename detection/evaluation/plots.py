@@ -34,8 +34,11 @@ CURVE_COLUMNS = (
 )
 
 
-def write_curves(evaluation: Evaluation, folder: Path) -> list[Path]:
-    """curves.csv, scores.csv and one picture of each per class and range in `folder`; returns what was written."""
+def write_curves(evaluation: Evaluation, folder: Path, *, pictures: bool = True) -> list[Path]:
+    """curves.csv, scores.csv and one picture of each per class and range in `folder`; returns what was written.
+
+    pictures  False: the tables alone, without matplotlib
+    """
     folder.mkdir(parents=True, exist_ok=True)
     written = [folder / "curves.csv", folder / "scores.csv"]
     _write_csv(
@@ -50,11 +53,12 @@ def write_curves(evaluation: Evaluation, folder: Path) -> list[Path]:
     for cls, bounds in dict.fromkeys((target.cls, target.range) for target in evaluation.targets):
         chosen = [target for (name, where, _), target in strictest.items() if (name, where) == (cls, bounds)]
         suffix = "" if range_text(bounds) == "all" else f"_{range_text(bounds).replace(' ', '')}"
-        written.append(folder / f"curves_{cls}{suffix}.png")
-        _draw_curves(evaluation, chosen, written[-1])
         edges, groups = score_histogram(evaluation.matcher, chosen[-1], level=1)
-        written.append(folder / f"scores_{cls}{suffix}.png")
-        _draw_histogram(edges, groups, f"{_title(chosen[-1])}, moderate", written[-1])
+        if pictures:
+            drawn = [folder / f"{what}_{cls}{suffix}.png" for what in ("curves", "scores")]
+            _draw_curves(evaluation, chosen, drawn[0])
+            _draw_histogram(edges, groups, f"{_title(chosen[-1])}, moderate", drawn[1])
+            written += drawn
         for name, counts in groups.items():
             histogram_rows += [
                 (cls, chosen[-1].metric, range_text(bounds), name, f"{low:.6g}", f"{high:.6g}", int(count))

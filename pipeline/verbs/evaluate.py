@@ -9,6 +9,7 @@ import sys
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TextIO
 
@@ -21,9 +22,10 @@ if TYPE_CHECKING:
     from detection.evaluation.kitti_ap import Evaluation, Report
 
 
+# This module is the command line of the distribution auglidar-eval too, under that program's name.
 EXAMPLES = """\
 examples:
-  run_pipeline --stage evaluate --labels KITTI/training/label_2 \\
+  %(prog)s --labels KITTI/training/label_2 \\
       --detections runs/kitti/detections
   ... --split KITTI/ImageSets/val.txt --classes Car --recall 40 --bootstrap 1000
   ... --explain --json scores.json    why objects are missed; scores for scripts
@@ -139,10 +141,7 @@ def _run(args: argparse.Namespace) -> int:
     if args.explain:
         _explain(evaluation, screen)
     if args.curves:
-        from detection.evaluation.plots import write_curves
-
-        for path in write_curves(evaluation, Path(args.curves)):
-            print(f"wrote {path}", file=screen)
+        _curves(evaluation, Path(args.curves), screen)
     _write(args.json, lambda: json.dumps(result, indent=1, allow_nan=False) + "\n")
     _write(args.markdown, lambda: markdown_table(report))
     _write(args.latex, lambda: latex_table(report["results"]))
@@ -257,6 +256,16 @@ def _explain(evaluation: Evaluation, screen: TextIO) -> None:
         print(file=screen)
 
 
+def _curves(evaluation: Evaluation, folder: Path, screen: TextIO) -> None:
+    from detection.evaluation.plots import write_curves
+
+    pictures = find_spec("matplotlib") is not None
+    if not pictures:
+        print("WARNING: pictures of the curves are left out: they need matplotlib", file=sys.stderr)
+    for path in write_curves(evaluation, folder, pictures=pictures):
+        print(f"wrote {path}", file=screen)
+
+
 def _write(place: str | None, text: Callable[[], str]) -> None:
     """Write to a file by atomic rename, or to stdout for "-"."""
     if place is None:
@@ -265,14 +274,3 @@ def _write(place: str | None, text: Callable[[], str]) -> None:
         sys.stdout.write(text())
         return
     write_text(Path(place), text())
-
-
-def main() -> int:
-    """`python -m pipeline.verbs.evaluate`."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    add_arguments(parser)
-    return run(parser.parse_args())
-
-
-if __name__ == "__main__":
-    sys.exit(main())
