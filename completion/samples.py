@@ -17,6 +17,7 @@ from torch import Tensor
 
 from auglidar_base.errors import SettingsError
 from completion.types import DepthFrame, FloatMap
+from completion.warping import Views, enlarged, turned
 from completion.windows import window_corner, window_intrinsics
 
 
@@ -48,6 +49,9 @@ class Augmentation:
     noise         largest standard deviation of Gaussian image noise, grey levels
     drop          largest share of sparse samples removed at random (published DC: 0.1)
     edge_crops    probability that the crop is the one of four with the most depth edges
+    top           rows left out at the top of a frame (published NLSPN on KITTI: 100)
+    rotate        largest turn of a frame to either side, degrees (NLSPN: 5)
+    scale         largest factor a frame is enlarged by, its depths divided by it (NLSPN: 1.5); 1: none
     """
 
     crop: tuple[int, int] | None = None
@@ -58,6 +62,13 @@ class Augmentation:
     noise: float = 0.0
     drop: float = 0.0
     edge_crops: float = 0.0
+    top: int = 0
+    rotate: float = 0.0
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.scale < 1:
+            raise SettingsError(f"scale: expected >= 1, got {self.scale}")
 
 
 class Crop(NamedTuple):
@@ -130,6 +141,17 @@ def disturb_image(image: NDArray[np.uint8], augmentation: Augmentation, rng: np.
     return (values.clip(0, 1) * 255 + 0.5).astype(np.uint8)
 
 
+def _warped(views: Views, augmentation: Augmentation, rng: np.random.Generator) -> Views:
+    """The frame without its top rows, turned and enlarged by what is drawn."""
+    sparse, image, target = views
+    sparse, image, target = sparse[augmentation.top :], image[augmentation.top :], target[augmentation.top :]
+    if augmentation.rotate:
+        sparse, image, target = turned((sparse, image, target), rng.uniform(-augmentation.rotate, augmentation.rotate))
+    if augmentation.scale > 1:
+        sparse, image, target = enlarged((sparse, image, target), rng.uniform(1, augmentation.scale))
+    return sparse, image, target
+
+
 def draw_crop(
     sample: DepthFrame | TrainingSample, augmentation: Augmentation, rng: np.random.Generator
 ) -> tuple[FloatMap, NDArray[np.uint8], FloatMap]:
@@ -148,6 +170,10 @@ def placed_crop(sample: DepthFrame | TrainingSample, augmentation: Augmentation,
     sparse = frame.sparse if sample.draw_sparse is None else sample.draw_sparse(rng)
     if sparse.shape != frame.size:
         raise ValueError(f"draw_sparse: expected a map of {frame.size}, got {sparse.shape}")
+    if augmentation.top or augmentation.rotate or augmentation.scale > 1:
+        sparse, image, target = _warped((sparse, frame.image, frame.target), augmentation, rng)
+        frame = DepthFrame(image, sparse, target)  # whose K was of another view
+    assert frame.target is not None
     top, left, h, w = _corner(frame, augmentation, rng)
     rows, columns = slice(top, top + h), slice(left, left + w)
     sparse, target, image = sparse[rows, columns], frame.target[rows, columns], frame.image[rows, columns]

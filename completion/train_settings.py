@@ -16,6 +16,12 @@ from completion.models import ModelSpec
 from completion.samples import Augmentation
 from completion.training_loss import LossSettings, fits
 
+_LATER = (
+    ("loss", "clamp_depth", 0),
+    ("augmentation", "top", 0),
+    ("augmentation", "rotate", 0),
+    ("augmentation", "scale", 1),
+)
 PRECISIONS = {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 
@@ -41,8 +47,10 @@ class TrainSettings:
     max_steps        end earlier; None: do not (the schedules keep their length)
     accumulate       backward passes of one update
     crops_per_frame  crops taken from each frame read; must divide batch_size x accumulate
-    schedule         "halving" (learning rate x 0.5 every `halve_every` epochs) or "cosine" (to 0 at the end)
+    schedule         "halving" (learning rate x 0.5 every `halve_every` epochs), "cosine" (to 0 at the end) or
+                     "staircase" (`rate_factors`)
     halve_every      epochs
+    rate_factors     (from epoch, factor of the learning rate), ascending, the first from 0
     warmup_steps     learning rate rises linearly over these first steps
     clip_gradient    largest norm of an update's gradient; 0: none
     weight_decay     of Adam
@@ -82,6 +90,7 @@ class TrainSettings:
     crops_per_frame: int = 1
     schedule: str = "halving"
     halve_every: float = 5
+    rate_factors: tuple[tuple[float, float], ...] = ((0, 1.0),)
     warmup_steps: int = 0
     clip_gradient: float = 0.0
     weight_decay: float = 0.0
@@ -96,8 +105,11 @@ class TrainSettings:
 
     def __post_init__(self) -> None:
         fits(self.loss, self.model)
-        if self.schedule not in ("halving", "cosine"):
-            raise SettingsError(f"schedule: expected 'halving' or 'cosine', got {self.schedule!r}")
+        if self.schedule not in ("halving", "cosine", "staircase"):
+            raise SettingsError(f"schedule: expected 'halving', 'cosine' or 'staircase', got {self.schedule!r}")
+        starts = [start for start, _ in self.rate_factors]
+        if not starts or starts[0] != 0 or starts != sorted(starts):
+            raise SettingsError(f"rate_factors: expected pairs (from epoch, factor) ascending from 0, got {starts}")
         if self.precision not in PRECISIONS:
             raise SettingsError(f"precision: expected one of {', '.join(PRECISIONS)}, got {self.precision!r}")
         check_device(self.device)
@@ -116,8 +128,13 @@ class TrainSettings:
             del what[free]
         for free in ("save_seconds", "workers", "best_by", "decoding"):
             del what[free]
-        if self.warm_start is None:
-            del what["warm_start"]
+        # Later settings, left out where they change nothing, so that earlier runs go on.
+        later = {"warm_start": None, "rate_factors": ((0, 1.0),)}
+        for name in [name for name, idle in later.items() if what[name] == idle]:
+            del what[name]
+        for section, name, idle in _LATER:
+            if what[section][name] == idle:
+                del what[section][name]
         return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
 
@@ -126,6 +143,8 @@ def learning_rate(settings: TrainSettings, step: int, steps_per_epoch: int, tota
     rate = settings.learning_rate
     if settings.schedule == "halving":
         rate *= 0.5 ** int(step / steps_per_epoch / settings.halve_every)
+    elif settings.schedule == "staircase":
+        rate *= [factor for start, factor in settings.rate_factors if start <= step / steps_per_epoch][-1]
     else:
         rate *= 0.5 * (1 + torch.cos(torch.tensor(torch.pi * step / total, dtype=torch.float64)).item())
     return rate * min(1.0, (step + 1) / (settings.warmup_steps + 1))

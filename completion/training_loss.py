@@ -34,6 +34,8 @@ class LossSettings:
     above_top_ring   weight of pixels above the topmost measured ring, where nothing can be interpolated (0: no loss)
     max_depth        metres; deeper targets are left out (beyond a LiDAR's range nothing can be learned, yet their
                      errors outweigh the rest); 0: none are, as published
+    clamp_depth      metres; deeper targets and predictions count as this deep, predictions below 0 as 0 (NLSPN: 90 on
+                     KITTI, 10 on NYU); 0: none do
     auxiliary        weight of further outputs of a "dc" network (published: 0.8)
     """
 
@@ -50,6 +52,7 @@ class LossSettings:
     above_top_ring: float = 1.0
     max_depth: float = 0.0
     auxiliary: float = 0.8
+    clamp_depth: float = 0.0
 
     def __post_init__(self) -> None:
         if self.kind not in LOSS_KINDS:
@@ -72,6 +75,10 @@ def fits(loss_settings: LossSettings, spec: ModelSpec) -> None:
     needed = {"twin": "twin", "dc": "coefficients", "mixture": "mixture"}.get(loss_settings.kind, "depth")
     # A mixture has an expected depth, so that the same network can be trained by a loss on one depth.
     offered = (spec.output, "depth") if spec.output == "mixture" else (spec.output,)
+    if loss_settings.clamp_depth and spec.output != "depth":
+        raise SettingsError(
+            f"clamp_depth is for networks with output 'depth', {spec.architecture} gives {spec.output!r}"
+        )
     if needed not in offered:
         raise SettingsError(
             f"loss {loss_settings.kind!r} needs a network with output {needed!r}, "
@@ -111,6 +118,9 @@ def training_loss(
     progress       share of the training done, in [0, 1]
     """
     weights = pixel_weights(sparse, target, loss_settings)
+    if loss_settings.clamp_depth:
+        target = target.clamp(max=loss_settings.clamp_depth)
+        outputs = tuple(output.clamp(0, loss_settings.clamp_depth / spec.depth_unit) for output in outputs)
     if loss_settings.kind == "dc":
         return _coefficient_parts(outputs, target, weights, spec.bins, loss_settings)
     parts: dict[str, Tensor] = {}
