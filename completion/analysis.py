@@ -66,12 +66,6 @@ def relative_error_histograms(
     return edges, improved, worsened
 
 
-def counts_above(error_map: FloatMap, levels: Sequence[float] = (0.0, 0.01, 0.1, 1.0)) -> dict[float, tuple[int, int]]:
-    """Pixels better and worse by more than each level: {level: (A > level, A < -level)}."""
-    values = error_map[np.isfinite(error_map)]
-    return {level: (int((values > level).sum()), int((values < -level).sum())) for level in levels}
-
-
 def edge_region(foreground: Mask, width: float = 3.0) -> Mask:
     """Pixels whose Euclidean distance to the other side of the foreground boundary is below `width` (Table 4.2).
 
@@ -100,21 +94,6 @@ def region_metrics(
         for name, region in regions.items()
         if (target[region] > 0.1).any()
     }
-
-
-def error_per_distance(
-    prediction: FloatMap, target: FloatMap, edges: Sequence[float] = (0, 10, 20, 30, 40, 50, 60, 70, 80)
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Summed absolute error (m), summed squared error (m^2) and pixel count per interval of target distance.
-
-    Intervals are half open [a, b); target 0 is ignored. Sums and counts of several images may be added.
-    """
-    valid = target > 0
-    error = (prediction - target)[valid].astype(np.float64)
-    where = target[valid]
-    absolute = np.histogram(where, edges, weights=np.abs(error))[0]
-    squared = np.histogram(where, edges, weights=error**2)[0]
-    return absolute, squared, np.histogram(where, edges)[0].astype(np.int64)
 
 
 def mixed_share(

@@ -185,9 +185,3 @@ def cross_entropy(logits: Tensor, target: Tensor, weights: Tensor, bins: Bins = 
     entropy = (coefficients * (log_partition.unsqueeze(-1) - chosen)).sum(-1)
     pixels = weights[:, 0] * (coefficients.sum(-1) > 0).to(weights.dtype)
     return ((entropy * pixels).flatten(1).sum(1) / pixels.flatten(1).sum(1).clamp(min=1e-12)).mean()
-
-
-def target_entropy(target: Tensor, bins: Bins = OUTDOOR) -> Tensor:
-    """Entropy (...) in nats of each pixel's coefficients, the floor of the loss; 0 for invalid pixels."""
-    _, coefficients = sparse_code(target, bins)
-    return -torch.xlogy(coefficients, coefficients).sum(-1)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from completion.analysis import expected_loss, relative_error_histograms
-from completion.types import FloatMap
+from completion.analysis import expected_loss
 
 # Okabe and Ito's blue and orange.
 LOSS, EXPECTED = "#0072B2", "#E69F00"
@@ -51,22 +50,5 @@ def plot_expected_losses(
         expectation.set(xlabel="estimate [m]", ylabel="expected loss" if column == 0 else "")
         for depth in depths:
             expectation.axvline(depth, color="grey", linewidth=0.8, linestyle=":")
-    figure.savefig(path)
-    return path
-
-
-def plot_relative_errors(path: Path, maps: Sequence[FloatMap], unit: str = "m") -> Path:
-    """Fig. 4.8: how many pixels improve and worsen, by how much, on logarithmic axes."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    edges, improved, worsened = relative_error_histograms(maps)
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    axes.stairs(improved, edges, label="improved")
-    axes.stairs(worsened, edges, label="worsened")
-    axes.set(xscale="log", yscale="symlog", xlabel=f"difference of errors [{unit}]", ylabel="pixels")
-    axes.legend()
     figure.savefig(path)
     return path

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from detection.boxes import observation_angle, project_to_image
-from detection.kitti_format import KittiObject, format_line
+from detection.kitti_format import KittiObject
 from detection.types import Detections, PointFrame
 
 
@@ -26,8 +26,3 @@ def result_objects(detections: Detections, frame: PointFrame) -> list[KittiObjec
         bbox = (float(x1), float(y1), float(x2), float(y2))
         found.append(KittiObject(name, -1, -1, float(alpha), bbox, (h, w, l), (x, y, z), ry, float(score)))
     return found
-
-
-def result_text(detections: Detections, frame: PointFrame) -> str:
-    """The content of a result file; empty (not missing) when nothing is found."""
-    return "".join(f"{format_line(item)}\n" for item in result_objects(detections, frame))

@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 # Mean h, w, l of the KITTI training set per class; PointRCNN's CLS_MEAN_SIZE for cars, rounded means for the others.
@@ -116,21 +115,6 @@ class BinCoder:
         ry_bin, ry_res = self.encode_heading(ry)
         size_res = (sizes - mean_sizes) / mean_sizes
         return BinTargets(x_bin, x_res, z_bin, z_res, offsets[:, 1], ry_bin, ry_res, size_res)
-
-    def perfect_code(self, targets: BinTargets, confidence: float = 50.0) -> Tensor:
-        """(R, channels) code a perfect network would give: `confidence` logits on the target bins, exact residuals."""
-        n = self.location_bins
-
-        def logits(index: Tensor, bins: int) -> Tensor:
-            return F.one_hot(index, bins).to(targets.x_res) * confidence
-
-        def residuals(value: Tensor, bins: int) -> Tensor:
-            return value[:, None].expand(-1, bins)
-
-        fine = [residuals(targets.x_res, n), residuals(targets.z_res, n)] if self.fine_location else []
-        heading = [logits(targets.ry_bin, self.heading_bins), residuals(targets.ry_res, self.heading_bins)]
-        blocks = [logits(targets.x_bin, n), logits(targets.z_bin, n), *fine, targets.y_offset[:, None], *heading]
-        return torch.cat([*blocks, targets.size_res], dim=-1)
 
     def bin_centres(self, like: Tensor) -> Tensor:
         """(location_bins,) centres in metres relative to the anchor."""

@@ -163,8 +163,3 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
 def write_objects(path: Path, objects: Iterable[KittiObject]) -> None:
     """A label file, or a result file when the objects have scores; empty when there are none."""
     write_text(path, "".join(format_line(item) + "\n" for item in objects))
-
-
-def write_split(root: Path, name: str, frame_ids: Iterable[str]) -> None:
-    """ROOT/ImageSets/NAME.txt, one id a line."""
-    write_text(root / "ImageSets" / f"{name}.txt", "".join(f"{frame_id}\n" for frame_id in frame_ids))

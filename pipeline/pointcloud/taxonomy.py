@@ -73,11 +73,6 @@ def label_noise(
     return labels
 
 
-def count_labels(labels: NDArray[np.uint8]) -> dict[str, int]:
-    """Label name -> number, of any array of labels."""
-    return dict(zip(LABELS, np.bincount(labels.reshape(-1), minlength=len(LABELS)).tolist()))
-
-
 @njit(cache=True, nogil=True)
 def _label(estimate, truth, objects, limits, window, labels):  # type: ignore[no-untyped-def]
     base, slope, gap = limits

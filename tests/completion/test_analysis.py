@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from completion import analysis
-from completion.figures import plot_expected_losses, plot_relative_errors
+from completion.figures import plot_expected_losses
 
 
 def test_expected_loss_of_two_depths() -> None:
@@ -30,7 +30,6 @@ def test_relative_error_maps_and_counts() -> None:
     assert A[0, :2].tolist() == [1.0, -1.5]
     assert S[0, :2].tolist() == [3.0, -3.75]
     assert np.isnan(A[0, 2])
-    assert analysis.counts_above(A) == {0.0: (1, 1), 0.01: (1, 1), 0.1: (1, 1), 1.0: (0, 1)}
     edges, improved, worsened = analysis.relative_error_histograms([A], bins=10)
     assert improved.sum() == worsened.sum() == 1
     assert edges[0] == pytest.approx(1e-3)
@@ -55,16 +54,6 @@ def test_region_metrics_split_the_image() -> None:
     assert found["edge"]["mae_mm"] == pytest.approx(500)
     assert found["inside"]["mae_mm"] == 0
     assert found["whole"]["mae_mm"] == pytest.approx(500 / 3)
-
-
-def test_error_per_distance() -> None:
-    target = np.array([[5.0, 15.0, 15.0, 0.0, 79.9]], np.float32)
-    prediction = np.array([[6.0, 13.0, 15.0, 9.0, 79.4]], np.float32)
-    absolute, squared, counts = analysis.error_per_distance(prediction, target)
-    assert counts.tolist() == [1, 2, 0, 0, 0, 0, 0, 1]
-    assert absolute[:2].tolist() == [1, 2]
-    assert squared[1] == 4
-    assert absolute[7] == pytest.approx(0.5, abs=1e-5)
 
 
 def step_edge() -> np.ndarray:
@@ -96,5 +85,3 @@ def test_mixed_share_with_a_sparse_target_and_no_prediction() -> None:
 
 def test_figures_are_drawn(tmp_path: Path) -> None:
     assert plot_expected_losses(tmp_path / "expected.png").stat().st_size > 10_000
-    error_map = np.linspace(-2, 3, 100, dtype=np.float32).reshape(10, 10)
-    assert plot_relative_errors(tmp_path / "relative.png", [error_map]).stat().st_size > 5_000

@@ -21,6 +21,7 @@ from detection.models.box_coding import (
     rpn_coder,
     to_roi_frame,
 )
+from tests.reference.box_codes import perfect_code
 
 CAR = torch.tensor(MEAN_SIZES["Car"], dtype=torch.float64)
 
@@ -83,7 +84,7 @@ def test_first_stage_code_returns_the_box(offsets, sizes, ry, soft) -> None:
         [[3 + offsets[0], 1 + offsets[1] + sizes[0] / 2, 20 + offsets[2], *sizes, ry]], dtype=torch.float64
     )
     centre = box[:, :3] - torch.tensor([0, 0.5, 0], dtype=torch.float64) * box[:, 3:4]
-    code = coder.perfect_code(coder.encode(centre - point, box[:, 3:6], box[:, 6], CAR))
+    code = perfect_code(coder, coder.encode(centre - point, box[:, 3:6], box[:, 6], CAR))
     again = boxes_from_points(point, code, coder, CAR, soft)
     torch.testing.assert_close(again[:, :6], box[:, :6], atol=1e-6, rtol=0)
     assert math.cos(again[0, 6].item() - ry) == pytest.approx(1.0)
@@ -104,7 +105,7 @@ def test_second_stage_code_returns_the_box(offsets, dy, roi_ry, turn, soft) -> N
     bottom = roi[:, :3] + rotate_y(local, roi[:, 6])
     truth = torch.cat([bottom, torch.tensor([[1.6, 1.7, 4.4, roi_ry + turn]], dtype=torch.float64)], dim=1)
     seen = to_roi_frame(truth, roi)
-    code = coder.perfect_code(coder.encode(seen[:, :3], seen[:, 3:6], seen[:, 6], CAR))
+    code = perfect_code(coder, coder.encode(seen[:, :3], seen[:, 3:6], seen[:, 6], CAR))
     torch.testing.assert_close(boxes_from_rois(roi, code, coder, CAR, soft), truth, atol=1e-6, rtol=0)
 
 
@@ -114,7 +115,7 @@ def test_opposite_heading_is_folded() -> None:
     truth = roi.clone()
     truth[:, 6] += math.pi - 0.2
     seen = to_roi_frame(truth, roi)
-    code = coder.perfect_code(coder.encode(seen[:, :3], seen[:, 3:6], seen[:, 6], CAR))
+    code = perfect_code(coder, coder.encode(seen[:, :3], seen[:, 3:6], seen[:, 6], CAR))
     assert boxes_from_rois(roi, code, coder, CAR, True)[0, 6].item() == pytest.approx(0.3 - 0.2)
 
 

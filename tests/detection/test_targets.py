@@ -19,6 +19,7 @@ from detection.targets import (
     soft_labels,
 )
 from tests.detection.scenes import place_cars
+from tests.reference.box_codes import perfect_code
 
 ONE = torch.ones(1, dtype=torch.long)
 
@@ -115,7 +116,7 @@ def test_ground_truth_as_proposals_returns_through_the_second_stage(rng) -> None
     mean, coder = torch.tensor(MEAN_SIZES["Car"], dtype=torch.float64), rcnn_coder()
     rois, boxes = chosen.rois[kept], chosen.truth[kept]
     local = to_roi_frame(boxes, rois)
-    code = coder.perfect_code(coder.encode(local[:, :3], local[:, 3:6], local[:, 6], mean))
+    code = perfect_code(coder, coder.encode(local[:, :3], local[:, 3:6], local[:, 6], mean))
     refined = boxes_from_rois(rois, code, coder, mean, soft=False)
     overlap = torch.as_tensor(iou_3d_aligned(refined, boxes))
     # Clamping (1 mm of bins, 1 mrad of heading) is all that may be lost; headings off by over 45 degrees are folded.

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from pipeline.pointcloud.taxonomy import LABELS, Taxonomy, count_labels, label_noise
+from pipeline.pointcloud.taxonomy import LABELS, Taxonomy, label_noise
 from pipeline.simulation.noise import (
     NoiseSettings,
     add_noise,
@@ -132,6 +133,11 @@ def test_taxonomy_worked_by_hand(column: int, estimate: float, expected: str) ->
     completed[10, column] = estimate
     labels = label_noise(completed, truth, objects, Taxonomy())
     assert LABELS[labels[10, column]] == expected
+
+
+def count_labels(labels: NDArray[np.uint8]) -> dict[str, int]:
+    """Label name -> number, of any array of labels."""
+    return dict(zip(LABELS, np.bincount(labels.reshape(-1), minlength=len(LABELS)).tolist()))
 
 
 def test_blur_makes_noise_between_and_misalignment_does_not() -> None:
