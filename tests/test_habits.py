@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 import pipeline
+from tests.conftest import slow_tests
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
@@ -60,3 +63,24 @@ def test_one_version_everywhere() -> None:
     assert re.findall(r'^version = "([^"]+)"', alone, re.MULTILINE) == [version]
     assert version == pipeline.__version__ == str(read_yaml("CITATION.cff")["version"])
     assert re.findall(r"^## (\S+)", changelog, re.MULTILINE)[0] in (version, "Unreleased")
+
+
+def test_slow_tests_are_there_and_fast_leaves_them_out() -> None:
+    """Every listed test exists, and `scripts/test --fast` names a room that has none of them."""
+    for name in slow_tests():
+        file, _, function = name.partition("::")
+        assert f"def {function}(" in (ROOT / file).read_text(encoding="utf-8"), name
+    room = [sys.executable, "-m", "pytest", "--collect-only", "-p", "no:xdist", "tests/completion/cpu"]
+    every, fast = (
+        set(subprocess.run([*room, *more], cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines())
+        for more in ([], ["--fast"])
+    )
+    left_out = {line.split("[")[0] for line in every - fast if "::" in line}
+    assert left_out
+    assert left_out <= slow_tests()
+
+
+def test_a_room_without_tests_is_refused() -> None:
+    done = subprocess.run(["scripts/test", "--fast", "cellar"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "tests/pipeline/cellar" in done.stderr
