@@ -152,17 +152,30 @@ def recall_at(labels: Objects, found: Objects, threshold: float, name: str = "Ca
 
 
 def segmentation_figures(weights: Path, dataset: Dataset) -> dict[str, Any]:
-    """Share of pixels with the right class, and IoU of vehicles (car, truck, bus), over all frames."""
-    from pipeline.semantics.checkpoints import load_segmenter
-    from pipeline.semantics.conventions import CLASSES, NONE
+    """Share of pixels with the right class, IoU of vehicles (car, truck, bus) and people, over all frames.
 
-    segmenter = load_segmenter(weights)
-    vehicles = [CLASSES.index(name) for name in ("car", "truck", "bus")]
-    right = counted = both = either = 0
+    "points" are the shares of `pipeline.benchmark.mask_points`, by which masks are measured on real frames.
+    """
+    from pipeline.benchmark.mask_points import mask_scores
+    from pipeline.semantics.conventions import CLASSES, NONE
+    from pipeline.semantics.sources import open_semantics
+
+    masks = open_semantics(f"network:{weights}")
+    groups = {"vehicle_iou": ("car", "truck", "bus"), "people_iou": ("person", "rider")}
+    right = counted = 0
+    both, either = dict.fromkeys(groups, 0), dict.fromkeys(groups, 0)
     for frame in dataset:
-        found, known = segmenter.segment(frame.image), frame.semantics != NONE
+        found, known = masks.semantics(frame), frame.semantics != NONE
         right += int((found == frame.semantics)[known].sum())
         counted += int(known.sum())
-        ours, theirs = np.isin(found, vehicles) & known, np.isin(frame.semantics, vehicles)
-        both, either = both + int((ours & theirs).sum()), either + int((ours | theirs).sum())
-    return {"pixel_accuracy": round(right / max(counted, 1), 4), "vehicle_iou": round(both / max(either, 1), 4)}
+        for name, classes in groups.items():
+            numbers = [CLASSES.index(each) for each in classes]
+            ours, theirs = np.isin(found, numbers) & known, np.isin(frame.semantics, numbers)
+            both[name] += int((ours & theirs).sum())
+            either[name] += int((ours | theirs).sum())
+    points = {
+        entry["group"]: {key: round(entry[key], 4) for key in ("precision", "recall", "iou") if entry[key] is not None}
+        for entry in mask_scores(dataset, {"network": masks}, lambda _: None)
+    }
+    shares = {name: round(both[name] / max(either[name], 1), 4) for name in groups}
+    return {"pixel_accuracy": round(right / max(counted, 1), 4), **shares, "points": points}

@@ -25,8 +25,10 @@ ARCHITECTURES: dict[str, type[SegmentationNetwork]] = {
 }
 
 
-def save_segmenter(model: SegmentationNetwork, out: Path, training: dict[str, Any]) -> Path:
-    """Write OUT.safetensors and its card OUT.json.
+def save_segmenter(
+    model: SegmentationNetwork, out: Path, training: dict[str, Any], thresholds: Mapping[str, float] | None = None
+) -> Path:
+    """Write OUT.safetensors and its card OUT.json, with the thresholds that `load_segmenter` takes by default.
 
     Values are rounded to the network's `stored` type.
     """
@@ -43,6 +45,7 @@ def save_segmenter(model: SegmentationNetwork, out: Path, training: dict[str, An
         "convention": "cityscapes_trainIds",
         "data": "synthetic street scenes of this project",
         **({"origin": model.origin} if model.origin else {}),
+        **({"thresholds": dict(thresholds)} if thresholds else {}),
         "training": training,
     }
     write_bytes(out.with_suffix(".json"), (json.dumps(card, indent=2) + "\n").encode())

@@ -42,11 +42,11 @@ class NetworkSegmenter:
         """(H, W, 3) uint8 RGB -> (H, W) uint8 Cityscapes trainIds."""
         height, width = image.shape[:2]
         # Arg max at half size, then doubled: 19 maps of full size would cost more than the network itself.
+        half = ((height + 1) // 2, (width + 1) // 2)
         with torch.inference_mode():
-            logits = F.interpolate(
-                self._logits(image), size=((height + 1) // 2, (width + 1) // 2), mode="bilinear", align_corners=False
-            )[0]
-            labels = _thresholded(logits, self.thresholds).to(torch.uint8).numpy()
+            logits = F.interpolate(self._logits(image), size=half, mode="bilinear", align_corners=False)[0]
+            found = _thresholded(logits, self.thresholds) if self.thresholds else logits.argmax(dim=0)
+            labels = found.to(torch.uint8).numpy()
         return np.ascontiguousarray(labels.repeat(2, axis=0).repeat(2, axis=1)[:height, :width])
 
     def scores(self, image: NDArray[np.uint8], groups: Sequence[Sequence[int]]) -> NDArray[np.float32]:
@@ -69,20 +69,15 @@ class NetworkSegmenter:
 
 
 def _thresholded(logits: Tensor, thresholds: Mapping[str, float]) -> Tensor:
-    """(19, h, w) logits -> (h, w) labels: the likeliest class, but that of a group wherever it reaches its threshold.
-
-    Where two groups reach theirs, the later in `GROUPS` counts.
+    """(19, h, w) logits -> (h, w) labels: the likeliest class outside the groups that have a threshold, but that of a
+    group wherever its summed probability reaches it. Where two groups reach theirs, the later in `GROUPS` counts.
     """
-    if not thresholds:
-        return logits.argmax(dim=0)
     probability = logits.softmax(dim=0)
     groups = {name: list(classes) for name, classes in GROUPS.items() if name in thresholds}
-    others = probability.clone()
-    for classes in groups.values():
-        others[classes] = -1
-    labels = others.argmax(dim=0)
+    grouped = {number for classes in groups.values() for number in classes}
+    others = torch.tensor([number for number in range(len(logits)) if number not in grouped])
+    labels = others[logits[others].argmax(dim=0)]
     for name, classes in groups.items():
-        of_group = probability[classes]
-        likeliest = torch.tensor(classes)[of_group.argmax(dim=0)]
-        labels = torch.where(of_group.sum(dim=0) >= thresholds[name], likeliest, labels)
+        reached = probability[classes].sum(dim=0) >= thresholds[name]
+        labels[reached] = torch.tensor(classes)[logits[classes][:, reached].argmax(dim=0)]
     return labels

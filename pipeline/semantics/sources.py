@@ -16,6 +16,7 @@ from pipeline.base.errors import DataError, UsageError
 from pipeline.data.frame import Frame
 from pipeline.data.images import read_unchanged
 from pipeline.semantics.conventions import GROUPS, NONE, to_train_ids
+from pipeline.semantics.riders import without_parked_cycles
 
 if TYPE_CHECKING:
     from pipeline.semantics.inference import NetworkSegmenter
@@ -33,7 +34,7 @@ KITTI_CLASSES = {
 
 
 # The bundled network of "network" and "soft" without a name.
-DEFAULT_WEIGHTS = "street-small"
+DEFAULT_WEIGHTS = "street-lite"
 
 
 class SemanticsSource(Protocol):
@@ -98,6 +99,17 @@ class ModelMasks:
 
 
 @dataclass(frozen=True)
+class ObjectsOnly:
+    """Labels without what looks like an object of KITTI's and is none: cycles that nobody rides."""
+
+    masks: ModelMasks
+
+    def semantics(self, frame: Frame) -> NDArray[np.uint8]:
+        """The labels, see `pipeline.semantics.riders`."""
+        return without_parked_cycles(self.masks.semantics(frame))
+
+
+@dataclass(frozen=True)
 class SoftMasks:
     """Our network's probability that a pixel shows any of `classes` (trainIds)."""
 
@@ -113,7 +125,8 @@ def open_semantics(source: str, convention: str | None = None) -> SemanticsSourc
     """The source a setting names: truth, boxes, files:FOLDER, network[:WEIGHTS], soft[:WEIGHTS], onnx:FILE, hf:FOLDER.
 
     "soft" gives the network's scores of vehicles, pedestrians and cyclists instead of labels. The scores from which
-    "network" calls a pixel a vehicle or a person follow its name: network:WEIGHTS:vehicles=0.7:people=0.3.
+    "network" calls a pixel a vehicle or a person follow its name: network:WEIGHTS:vehicles=0.7:people=0.3. Its
+    cycles that nobody rides become 255.
 
     convention  of the labels in files or of an ONNX model's output; a folder may hold it in mask.json instead
 
@@ -168,7 +181,7 @@ def _own_network(kind: str, place: str) -> SemanticsSource:
         model = load_segmenter(weights, thresholds)
     except ValueError as error:
         raise UsageError(f"semantics: {error}") from None
-    return ModelMasks(model) if kind == "network" else SoftMasks(model, OBJECTS)
+    return ObjectsOnly(ModelMasks(model)) if kind == "network" else SoftMasks(model, OBJECTS)
 
 
 def boxes_to_semantics(labels: Sequence[KittiObject], image_size: tuple[int, int]) -> NDArray[np.uint8]:

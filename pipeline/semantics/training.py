@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
-import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from torch import Tensor
 
 from auglidar_base.devices import check_device, resolve_device
@@ -21,12 +20,13 @@ from auglidar_base.errors import SettingsError
 from auglidar_base.progress import Pace, TrainProgress
 from auglidar_base.seeding import derived_seed, torch_seeded
 from completion.resume import load_state, save_state
-from completion.samples import Augmentation, disturb_image
 from completion.training_log import append_row, keep_rows
 from pipeline.semantics.checkpoints import read_segmenter, save_segmenter
 from pipeline.semantics.conventions import CLASSES, NONE
+from pipeline.semantics.crops import CropSettings, draw_crop
+from pipeline.semantics.inference import SegmentationNetwork
 from pipeline.semantics.network import StreetSegmenter
-from pipeline.semantics.pictures import LabelledImage, image_tensor
+from pipeline.semantics.pictures import LabelledImage, Normalisation, image_tensor
 from pipeline.semantics.validation import validation_figures
 
 # What random numbers are for: a generator derives from (seed, purpose, step).
@@ -34,8 +34,8 @@ _CROPS, _DROPOUT = 1, 2
 
 
 @dataclass(frozen=True)
-class SegmentationSettings:
-    """One training run.
+class SegmentationSettings(CropSettings):
+    """One training run, and with the fields of `CropSettings` its crops.
 
     steps            updates of the weights in all, over which the schedule runs
     batch_size       crops of one update
@@ -44,13 +44,11 @@ class SegmentationSettings:
     validate_every   steps between validations; 0: only at the end
     device           "auto", "cpu", "cuda", "cuda:N" or "mps"
     seed             of everything random
-    warm_start       weights (a path or a bundled name) of the same network to begin with
-    crop             (height, width) in pixels
-    zoom             crops are enlarged by up to this factor or reduced by its inverse
-    jitter           of colours, as `completion.samples.Augmentation`
-    gamma            of colours, as there
-    noise            of colours, as there
-    grey             share of crops without colour
+    warm_start       weights (a path or a bundled name) to begin with, which also say which network; without them the
+                     small one (`pipeline.semantics.network`) begins anew
+    even_scores      the saved network's scores are freed of the weights that rare classes have in training, so that
+                     they are shares of right pixels, for thresholds; the likeliest class then is seldom a rare one
+    thresholds       for the card: scores from which a pixel is of a group, {vehicles: 0.5, people: 0.5}
     validation_frames  frames of a validation, at most
     best_by          the validation figure that chooses the best checkpoint, higher is better
     log_every        steps between rows of log.csv
@@ -66,12 +64,8 @@ class SegmentationSettings:
     device: str = "cpu"
     seed: int = 0
     warm_start: str | None = None
-    crop: tuple[int, int] = (256, 384)
-    zoom: float = 1.5
-    jitter: float = 0.4
-    gamma: float = 0.5
-    noise: float = 8.0
-    grey: float = 0.15
+    even_scores: bool = False
+    thresholds: dict[str, float] = field(default_factory=dict)
     validation_frames: int = 50
     best_by: str = "mean_iou"
     log_every: int = 50
@@ -85,7 +79,15 @@ class SegmentationSettings:
     def identity(self, samples: int) -> str:
         """JSON of everything that determines the weights; a run resumes only under the same one."""
         values = asdict(self)
-        for free in ("save_every", "validate_every", "validation_frames", "best_by", "log_every", "device"):
+        for free in (
+            "save_every",
+            "validate_every",
+            "validation_frames",
+            "best_by",
+            "log_every",
+            "device",
+            "thresholds",
+        ):
             del values[free]
         return json.dumps(values | {"samples": samples}, sort_keys=True)
 
@@ -127,18 +129,12 @@ def train_segmenter(
     return best if best.is_file() else out / "last.safetensors"
 
 
-def _first_model(settings: SegmentationSettings) -> StreetSegmenter:
+def _first_model(settings: SegmentationSettings) -> SegmentationNetwork:
     """The network before the first step, on the CPU."""
+    if settings.warm_start is not None:
+        return read_segmenter(settings.warm_start)[0]
     with torch_seeded(settings.seed, torch.device("cpu")):
-        model = StreetSegmenter()
-        if settings.warm_start is not None:
-            start, _ = read_segmenter(settings.warm_start)
-            if not isinstance(start, StreetSegmenter):
-                raise SettingsError(
-                    f"warm_start: {settings.warm_start} holds a {type(start).__name__}, not StreetSegmenter"
-                )
-            model.load_state_dict(start.state_dict())
-    return model
+        return StreetSegmenter()
 
 
 class _Run:
@@ -147,10 +143,11 @@ class _Run:
     def __init__(self, samples: Sequence[LabelledImage], settings: SegmentationSettings, folder: Path) -> None:
         self.samples, self.settings, self.folder = samples, settings, folder
         self.device = resolve_device(settings.device)
-        self.model: StreetSegmenter = _first_model(settings).to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        rate = settings.learning_rate
-        self.optimiser = torch.optim.AdamW(self.model.parameters(), lr=rate, weight_decay=1e-4)
-        self.schedule = torch.optim.lr_scheduler.OneCycleLR(self.optimiser, rate, total_steps=settings.steps)
+        self.model: SegmentationNetwork = _first_model(settings).to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        groups = self.model.parameter_groups(settings.learning_rate)
+        rates = [group["lr"] for group in groups]
+        self.optimiser = torch.optim.AdamW(groups, weight_decay=1e-4)
+        self.schedule = torch.optim.lr_scheduler.OneCycleLR(self.optimiser, rates, total_steps=settings.steps)
         self.weights = _class_weights(samples).to(self.device)
         self.step, self.best = 0, -1.0
         self.losses: list[float] = []  # since the last row of the log
@@ -161,7 +158,8 @@ class _Run:
         """One update."""
         settings = self.settings
         random = np.random.default_rng([settings.seed, _CROPS, self.step])
-        images, labels = (part.to(self.device) for part in _crops(self.samples, settings, random))
+        crops = _crops(self.samples, settings, self.model.normalisation, random)
+        images, labels = (part.to(self.device) for part in crops)
         # At half size, as `NetworkSegmenter` labels: the 19 maps of full size would cost a quarter of the step.
         labels = labels[:, ::2, ::2]
         self.model.train()
@@ -197,7 +195,8 @@ class _Run:
         """NAME.safetensors with its card."""
         hours = round(self.pace.spent(time.monotonic()) / 3600, 3)
         described = asdict(self.settings) | {"samples": len(self.samples), "step": self.step, "hours": hours}
-        save_segmenter(self.model, self.folder / name, described | facts)
+        model = _with_even_scores(self.model, self.weights) if self.settings.even_scores else self.model
+        save_segmenter(model, self.folder / name, described | facts, self.settings.thresholds)
 
     def save(self) -> None:
         """The last checkpoint, then the state that the run resumes from."""
@@ -229,6 +228,16 @@ class _Run:
         return self.step, seconds
 
 
+def _with_even_scores(model: SegmentationNetwork, weights: Tensor) -> SegmentationNetwork:
+    """A copy whose scores p' are those of training without class weights: p' is proportional to p / weight."""
+    even = copy.deepcopy(model)
+    seen = torch.where(weights > 0, weights, torch.ones_like(weights))
+    with torch.no_grad():
+        assert even.classify.bias is not None
+        even.classify.bias -= seen.log()
+    return even
+
+
 def _class_weights(samples: Sequence[LabelledImage]) -> Tensor:
     """(19,) weights, 1 on average over the classes that occur."""
     seen = min(50, len(samples))
@@ -239,46 +248,18 @@ def _class_weights(samples: Sequence[LabelledImage]) -> Tensor:
 
 
 def _crops(
-    samples: Sequence[LabelledImage], settings: SegmentationSettings, random: np.random.Generator
+    samples: Sequence[LabelledImage],
+    settings: SegmentationSettings,
+    normalisation: Normalisation,
+    random: np.random.Generator,
 ) -> tuple[Tensor, Tensor]:
     """(B, 3, h, w) images and (B, h, w) labels. Two crops are taken of every frame that is read."""
-    colours = Augmentation(jitter=settings.jitter, gamma=settings.gamma, noise=settings.noise)
     images, labels = [], []
     for number in range(settings.batch_size):
         if number % 2 == 0:
             sample = samples[int(random.integers(len(samples)))]
             whole, classes = sample.image, sample.semantics
-        image, semantics = _crop(whole, classes, settings, random)
-        image = disturb_image(image, colours, random)
-        if random.random() < settings.grey:
-            image = np.repeat(image.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
-        images.append(image_tensor(image))
+        image, semantics = draw_crop(whole, classes, settings, random)
+        images.append(image_tensor(image, normalisation))
         labels.append(torch.from_numpy(np.ascontiguousarray(semantics)).long())
     return torch.cat(images).contiguous(memory_format=torch.channels_last), torch.stack(labels)
-
-
-def _crop(
-    image: NDArray[np.uint8], semantics: NDArray[np.uint8], settings: SegmentationSettings, random: np.random.Generator
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """A random place at a random size, mirrored half of the time, brought to the crop's size."""
-    height, width = settings.crop
-    factor = float(np.exp(random.uniform(-1, 1) * np.log(settings.zoom)))
-    taken = (round(height / factor), round(width / factor))
-    image, semantics = _padded(image, taken), _padded(semantics, taken, NONE)
-    top = int(random.integers(image.shape[0] - taken[0] + 1))
-    left = int(random.integers(image.shape[1] - taken[1] + 1))
-    image = image[top : top + taken[0], left : left + taken[1]]
-    semantics = semantics[top : top + taken[0], left : left + taken[1]]
-    if random.random() < 0.5:
-        image, semantics = image[:, ::-1], semantics[:, ::-1]
-    size = (width, height)
-    resized = cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_LINEAR)
-    labels = cv2.resize(np.ascontiguousarray(semantics), size, interpolation=cv2.INTER_NEAREST)
-    return resized.astype(np.uint8), labels.astype(np.uint8)
-
-
-def _padded(values: NDArray[Any], crop: tuple[int, int], fill: int = 0) -> NDArray[Any]:
-    """At least the crop's size, filled at the bottom and on the right."""
-    missing = [max(0, want - have) for want, have in zip(crop, values.shape[:2])]
-    borders = [(0, missing[0]), (0, missing[1])] + [(0, 0)] * (values.ndim - 2)
-    return np.pad(values, borders, constant_values=fill) if any(missing) else values

@@ -7,13 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import nn
 
 from pipeline.semantics.conventions import CLASSES, NONE
+from pipeline.semantics.inference import SegmentationNetwork
 from pipeline.semantics.pictures import LabelledImage, image_tensor
 
 
-def validation_figures(model: nn.Module, frames: Sequence[LabelledImage], device: torch.device) -> dict[str, float]:
+def validation_figures(
+    model: SegmentationNetwork, frames: Sequence[LabelledImage], device: torch.device
+) -> dict[str, float]:
     """Shares in [0, 1] of the labelled pixels, at half size as the network labels: "pixel_accuracy", and "mean_iou"
     over the classes that the frames show. The network should be in evaluation mode.
     """
@@ -22,7 +24,7 @@ def validation_figures(model: nn.Module, frames: Sequence[LabelledImage], device
     for frame in frames:
         truth = frame.semantics[::2, ::2]
         with torch.inference_mode():
-            logits = model(image_tensor(frame.image).to(device))
+            logits = model(image_tensor(frame.image, model.normalisation).to(device))
             half = F.interpolate(logits, size=truth.shape, mode="bilinear", align_corners=False)
             found = half.argmax(dim=1)[0].cpu().numpy()
         known = (truth != NONE) & (truth < count)

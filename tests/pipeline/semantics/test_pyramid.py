@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +14,22 @@ from torch import Tensor, nn
 from pipeline.base.errors import DataError, UsageError
 from pipeline.cli import main
 from pipeline.semantics.checkpoints import load_segmenter, read_segmenter, save_segmenter
+from pipeline.semantics.conventions import GROUPS
 from pipeline.semantics.efficientnet_lite import EfficientNetLite, SamePadConv, backbone_state
 from pipeline.semantics.inference import NetworkSegmenter, _thresholded
 from pipeline.semantics.pyramid import PyramidSegmenter
 from pipeline.semantics.sources import DEFAULT_WEIGHTS, network_choice, open_semantics
+from pipeline.semantics.training import SegmentationSettings, train_segmenter
 
 # Kernel, input and output channels of the sixteen blocks of EfficientNet-B0 (Table 1 of the paper), written out.
 BLOCKS = [(3, 32, 16), (3, 16, 24), (3, 24, 24), (5, 24, 40), (5, 40, 40), (3, 40, 80), (3, 80, 80), (3, 80, 80)]
 BLOCKS += [(5, 80, 112), (5, 112, 112), (5, 112, 112), (5, 112, 192), *[(5, 192, 192)] * 3, (3, 192, 320)]
+
+
+@dataclass(frozen=True)
+class Sample:
+    image: np.ndarray
+    semantics: np.ndarray
 
 
 def published() -> dict[str, Tensor]:
@@ -162,10 +171,25 @@ def test_a_group_counts_from_its_threshold_on() -> None:
     probability[[11, 0], 0, 1] = torch.tensor([0.35, 0.65])
     probability[[13, 18, 10], 0, 2] = torch.tensor([0.4, 0.35, 0.25])
     logits = probability.log()
-    assert _thresholded(logits, {}).tolist() == [[13, 0, 13]]
-    assert _thresholded(logits, {"vehicles": 0.69, "people": 0.3}).tolist() == [[13, 11, 18]]
-    assert _thresholded(logits, {"vehicles": 0.71}).tolist() == [[0, 0, 18]]
-    assert _thresholded(logits, {"vehicles": 0.41, "people": 0.36}).tolist() == [[13, 0, 10]]
+
+    def labels(**thresholds: float) -> list[list[int]]:
+        return _thresholded(logits, thresholds).tolist()
+
+    assert labels(vehicles=0.69, people=0.3) == [[13, 11, 18]]
+    assert labels(vehicles=0.71) == [[0, 0, 18]]
+    assert labels(vehicles=0.41, people=0.36) == [[13, 0, 10]]
+
+
+def test_labels_follow_the_scores(tmp_path: Path) -> None:
+    torch.manual_seed(1)
+    model, image = PyramidSegmenter(), np.random.default_rng(4).integers(0, 255, (64, 96, 3)).astype(np.uint8)
+    score = NetworkSegmenter(model).score(image, GROUPS["vehicles"])
+    middle = float(np.median(score))
+    found = np.isin(NetworkSegmenter(model, {"vehicles": middle}).segment(image), GROUPS["vehicles"])
+    # Labels are of half size: only scores close to the threshold may fall to the other side.
+    clear = np.abs(score - middle) > 0.1 * np.ptp(score)
+    assert clear.any()
+    np.testing.assert_array_equal(found[clear], score[clear] > middle)
 
 
 def test_thresholds_follow_the_name_of_a_source(tmp_path: Path) -> None:
@@ -175,10 +199,42 @@ def test_thresholds_follow_the_name_of_a_source(tmp_path: Path) -> None:
     weights = save_segmenter(PyramidSegmenter(), tmp_path / "lite", {})
     card = json.loads(weights.with_suffix(".json").read_text())
     weights.with_suffix(".json").write_text(json.dumps(card | {"thresholds": {"vehicles": 0.6, "people": 0.4}}))
-    assert open_semantics(f"network:{weights}:people=0.1").model.thresholds == {"vehicles": 0.6, "people": 0.1}
+    assert open_semantics(f"network:{weights}:people=0.1").masks.model.thresholds == {"vehicles": 0.6, "people": 0.1}
     with pytest.raises(UsageError, match="vehicles=high"):
         open_semantics(f"network:{weights}:vehicles=high")
     with pytest.raises(UsageError, match=r"vehicles 1\.5"):
         open_semantics(f"network:{weights}:vehicles=1.5")
     with pytest.raises(UsageError, match="soft masks have one threshold"):
         open_semantics(f"soft:{weights}:vehicles=0.5")
+
+
+def test_training_begins_with_the_network_it_is_given(tmp_path: Path) -> None:
+    """A picture of road and car, from weights that know nothing; its even scores are p / weight."""
+    start = save_segmenter(PyramidSegmenter(), tmp_path / "start", {})
+    image = np.full((64, 64, 3), 90, np.uint8)
+    semantics = np.zeros((64, 64), np.uint8)
+    image[40:, :16], semantics[40:, :16] = 200, 13
+    settings = SegmentationSettings(
+        steps=3,
+        batch_size=1,
+        crop=(64, 64),
+        zoom=1.0,
+        warm_start=str(start),
+        learning_rate=0.03,
+        thresholds={"vehicles": 0.3},
+    )
+    models = {}
+    for even in (False, True):
+        samples = [Sample(image, semantics)]
+        out = tmp_path / str(even)
+        weights = train_segmenter(replace(settings, even_scores=even), samples, out)
+        models[even], card = read_segmenter(weights)
+        assert card["architecture"] == "PyramidSegmenter"
+        assert load_segmenter(weights).thresholds == {"vehicles": 0.3}
+    first, _ = read_segmenter(start)
+    assert models[False].backbone.stem[0].weight.equal(first.backbone.stem[0].weight)
+    assert not models[False].classify.weight.equal(first.classify.weight)
+    shift = models[False].state_dict()["classify.bias"] - models[True].state_dict()["classify.bias"]
+    # Road covers 3712 pixels, the car 384: the car's weight is the root of that ratio times the road's.
+    assert float((shift[13] - shift[0]).exp()) == pytest.approx((3712 / 384) ** 0.5, rel=0.01)
+    assert float(shift[10]) == 0

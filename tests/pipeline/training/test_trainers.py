@@ -26,6 +26,7 @@ from completion.training_loss import LossSettings
 from detection.train import TrainSettings as DetectorSettings
 from pipeline.base.settings import with_changes
 from pipeline.cli import main
+from pipeline.semantics.network import StreetSegmenter
 from pipeline.semantics.training import SegmentationSettings, train_segmenter
 from pipeline.semantics.validation import validation_figures
 from pipeline.training.stage import print_progress, split
@@ -145,7 +146,7 @@ def test_thesis_schedules_by_epochs_or_steps() -> None:
 def test_segmentation_figures_by_hand() -> None:
     """Four pixels at half size: truth road road sky none, all found road."""
 
-    class AllRoad(torch.nn.Module):
+    class AllRoad(StreetSegmenter):
         def forward(self, image: torch.Tensor) -> torch.Tensor:
             logits = torch.zeros(1, 19, 1, 1)
             logits[:, 0] = 1
