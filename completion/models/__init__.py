@@ -59,8 +59,8 @@ class ModelSpec:
     @property
     def bins(self) -> Bins:
         """Depth bins of a network with output "coefficients", from its builder's arguments."""
-        chosen = {name: self.arguments[name] for name in ("count", "size", "layout") if name in self.arguments}
-        return Bins(**chosen)
+        given = {**getattr(MODELS[self.architecture].builder, "keywords", {}), **self.arguments}
+        return Bins(**{name: given[name] for name in ("count", "size", "layout") if name in given})
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,10 @@ MODELS: dict[str, Entry] = {
     "sparse_to_dense": Entry(SparseToDense, 1.0, "raw", "depth", 16),
     "twise_resnet": Entry(TwinSparseToDense, 80.0, "unit", "twin", 16),
     "depth_coefficients": Entry(CoefficientNetwork, 1.0, "unit", "coefficients", 16),
+    # As thesis Fig. 3.7 draws it: ResNet-34, 80 channels in and out. The published code has 18 layers and 82.
+    "depth_coefficients_34": Entry(
+        partial(CoefficientNetwork, layers=34, layout="compact"), 1.0, "unit", "coefficients", 16
+    ),
     # The 2x2 of thesis Table 3.3: sparse depth or coefficients in, metres or coefficients out, on one backbone.
     "resnet_depth_to_depth": Entry(
         partial(CoefficientSparseToDense, coefficient_input=False, coefficient_head=False), 1.0, "unit", "depth", 16

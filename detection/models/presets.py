@@ -101,6 +101,8 @@ def pointrcnn2(features: tuple[str, ...] = (), iou_branch: bool = False) -> Pres
 def thesis(features: tuple[str, ...] = (), dense: bool = True) -> Preset:
     """PointRCNN2 as thesis chapter 5 words it: the 8000 best scores, NMS 0.8, 64 boxes, no augmentation of RoIs.
 
+    In training NMS keeps 512 boxes, of which 64 RoIs are drawn, as in the released code; else nothing is left to draw.
+
     dense     50k uniformly drawn points (completed depth) instead of 16384 by the near/far rule
     features  ("semantic",) for the binary mask of section 5.3
     Train it with scene=None and paste=None.
@@ -109,7 +111,7 @@ def thesis(features: tuple[str, ...] = (), dense: bool = True) -> Preset:
     settings = replace(
         _epnet_settings(tuple(features), iou_branch=False),
         roi_augmentation=False,
-        proposals_train=proposals,
+        proposals_train=replace(proposals, after=512),
         proposals_test=proposals,
     )
     inputs = (

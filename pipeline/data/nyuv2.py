@@ -2,7 +2,7 @@
 
     labelled  nyu_depth_v2_labeled.mat (HDF5): images (N, 3, 640, 480), depths (N, 640, 480) in metres, both transposed
     h5        {train,val,...}/SCENE/*.h5 with rgb (3, H, W) uint8 and depth (H, W) float32 metres
-    folders   FRAME/{rgb.jpg|png, depth*.png} with 16-bit depth in millimetres, one folder per frame
+    folders   .../FRAME/{rgb.jpg|png, depth*.png} with 16-bit depth in millimetres, one folder per frame, at any depth
 
 `open_nyuv2` gives the protocol of the thesis: 640 x 480 halved, centre crop 304 x 208 (width x height), and 500 samples
 of the depth as input. `open_nyuv2_full` gives the frames as they are stored. Sources: Silberman et al. 2012; Ma and
@@ -56,7 +56,7 @@ def open_nyuv2_full(root: str | Path) -> Dataset:
     trees = sorted(str(path.relative_to(folder).with_suffix("")) for path in folder.rglob("*.h5"))
     if trees:
         return Dataset(tuple(trees), partial(_open_h5, folder), "nyuv2", str(folder))
-    plain = sorted({path.parent.name for path in folder.glob("*/rgb.*")})
+    plain = sorted({path.parent.relative_to(folder).as_posix() for path in folder.glob("*/**/rgb.*")})
     if plain:
         return Dataset(tuple(plain), partial(_open_plain, folder), "nyuv2", str(folder))
     raise UsageError(f"{folder}: no NYU Depth v2 frame found (expected {_LABELLED}, SCENE/*.h5 or FRAME/rgb.jpg)")

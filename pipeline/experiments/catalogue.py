@@ -4,10 +4,19 @@ from __future__ import annotations
 
 from pipeline.base.errors import UsageError
 from pipeline.base.settings import nearest_name
-from pipeline.experiments import bundled, chapter_2_3, chapter_4, chapter_5, chapter_5_exact, chapter_5_figures
+from pipeline.experiments import (
+    bundled,
+    chapter_1,
+    chapter_2_3,
+    chapter_4,
+    chapter_5,
+    chapter_5_exact,
+    chapter_5_figures,
+)
 from pipeline.experiments.tables import Table
 
 TABLES: tuple[Table, ...] = (
+    *chapter_1.TABLES,
     *chapter_2_3.TABLES,
     *chapter_4.TABLES,
     *chapter_5.TABLES,

@@ -111,6 +111,7 @@ def open_any(root: Path) -> Dataset:
         ("kitti_object", "training/depth_2"),
         ("nyuv2", "*.mat"),
         ("nyuv2", "**/*.h5"),
+        ("nyuv2", "*/**/rgb.*"),
     )
     if looks_like_vkitti2(root):
         return open_dataset("vkitti2", root)

@@ -157,3 +157,13 @@ def test_classical_methods_survive_few_samples(method: str, samples: int) -> Non
     sparse[10, 3 : 3 + samples] = 7.0  # on one line
     found = ClassicalCompleter(method).complete(sparse, np.zeros((20, 30, 3), np.uint8))
     assert found.depth.tolist() == np.full((20, 30), 7.0 if samples else 0.0).tolist()
+
+
+def test_the_network_of_figure_3_7_has_34_layers_and_80_channels() -> None:
+    spec = default_spec("depth_coefficients_34")
+    with torch.device("meta"):
+        state = build_model(spec).state_dict()
+    assert state["depth_input.weight"].shape[1] == state["head.weight"].shape[0] == spec.bins.channels == 80
+    blocks = [len({name.split(".")[1] for name in state if name.startswith(f"encoder{n}.")}) for n in (1, 2, 3, 4)]
+    assert blocks == [3, 4, 6, 3]
+    assert default_spec("depth_coefficients").bins.channels == 82

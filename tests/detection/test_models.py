@@ -261,3 +261,9 @@ def test_presets_can_be_rebuilt_from_their_options(name) -> None:
     assert again.outputs == preset.outputs
     assert again.options == preset.options
     assert parameters(again.build()) == parameters(preset.build())
+
+
+def test_the_thesis_trains_on_512_proposals_and_tests_on_64() -> None:
+    settings = thesis().build().settings
+    assert (settings.proposals_train.after, settings.proposals_test.after, settings.rois.rois) == (512, 64, 64)
+    assert settings.proposals_train.before == settings.proposals_test.before == 8000

@@ -11,6 +11,7 @@ import pytest
 from pipeline.base.errors import DataError, UsageError
 from pipeline.data import open_dataset
 from pipeline.data.nyuv2 import open_nyuv2, open_nyuv2_full, sample_depth
+from pipeline.experiments.frames import open_any
 
 h5py = pytest.importorskip("h5py")
 
@@ -91,3 +92,15 @@ def test_the_real_frames(nyu: Path) -> None:
 def test_nothing_there(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no NYU Depth v2 frame"):
         open_nyuv2(tmp_path)
+
+
+def test_folders_of_frames_may_stand_in_folders(tmp_path: Path, scene: tuple[np.ndarray, np.ndarray]) -> None:
+    image, depth = scene
+    for name in ("train/kitchen/00001", "val/kitchen/00001"):
+        (tmp_path / name).mkdir(parents=True)
+        cv2.imwrite(str(tmp_path / name / "rgb.png"), image[:, :, ::-1])
+        cv2.imwrite(str(tmp_path / name / "depth.png"), np.rint(1000 * depth).astype(np.uint16))
+    dataset = open_any(tmp_path)
+    assert (dataset.name, dataset.ids) == ("nyuv2", ("train/kitchen/00001", "val/kitchen/00001"))
+    np.testing.assert_array_equal(dataset[1].image[0, 0], dataset[0].image[0, 0])
+    assert dataset[1].target_depth.shape == (208, 304)

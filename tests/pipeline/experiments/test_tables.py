@@ -170,3 +170,22 @@ def test_findings_say_what_is_not_decidable(tmp_path: Path) -> None:
     assert summary([]) == NOT_DECIDABLE
     text = markdown(tmp_path, "smoke", 1)
     assert "TWISE smears less than L2 and L1 (4.5). | **not decidable**: not run |" in text
+
+
+def test_table_4_1_has_every_row_and_the_time_column() -> None:
+    table = find("table", "4.1")
+    assert len(table.rows) == 11
+    times = {row.label: row.printed[-1] for row in table.rows}
+    assert table.columns[-1].unit == "s"
+    assert (times["Ma"], times["DeepLidar"], times["Depth-Normal"], times["TWISE"]) == (0.081, 0.097, None, 0.022)
+    assert table.row("3DepthNet").printed[:6] == (226.2, 798.40, 1.02, 2.36, 208.96, 693.23)
+    assert table.row("Ma").recipe is not None
+
+
+def test_figure_1_1_varies_rows_and_sensors() -> None:
+    settings = [row.recipe.settings for row in find("figure", "1.1").rows if row.recipe is not None]
+    assert {(item["rows"], item["colour"]) for item in settings} == {
+        (0, True),
+        *((rows, colour) for rows in (64, 32, 16, 8) for colour in (True, False)),
+    }
+    assert {(item["network"], item["loss"]) for item in settings} == {("resnet18", "l2")}
