@@ -22,6 +22,7 @@ from detection.losses import (
 )
 from detection.models.box_coding import MEAN_SIZES, rcnn_coder, rpn_coder
 from tests.reference import detection_losses as twin
+from tests.reference.box_codes import perfect_code
 
 CAR = torch.tensor(MEAN_SIZES["Car"], dtype=torch.float64)
 
@@ -134,7 +135,7 @@ def test_the_iou_branch_learns_the_aligned_iou_without_headings() -> None:
     box = torch.tensor([[0.25, 0.0, 0.25, 1.5, 2.0, 4.0, 0.5]], dtype=torch.float64)
     wrong = box + torch.tensor([[1.0, 0, 0, 0, 0, 0, -0.5]], dtype=torch.float64)
     targets = coder.encode(box[:, :3], box[:, 3:6], box[:, 6], mean)
-    code = coder.perfect_code(coder.encode(wrong[:, :3], wrong[:, 3:6], wrong[:, 6], mean)).requires_grad_()
+    code = perfect_code(coder, coder.encode(wrong[:, :3], wrong[:, 3:6], wrong[:, 6], mean)).requires_grad_()
     iou = aligned_iou(code, targets, box[:, 3:6], mean, coder)
     assert iou.tolist() == pytest.approx([0.6])
     raw = torch.tensor([0.25], dtype=torch.float64, requires_grad=True)
