@@ -11,7 +11,7 @@ from detection.evaluation.curves import resampled_ap
 from detection.evaluation.difficulty import LEVELS, DifficultyRule
 from detection.evaluation.explain import explain, sum_reasons
 from detection.evaluation.kitti_ap import Evaluation, found_share, prepare
-from detection.evaluation.protocol import EVERYWHERE, Range, Target
+from detection.evaluation.protocol import EVERYWHERE, Range, RecallPoints, Target
 from detection.kitti_format import KittiObject
 from pipeline.experiments.chapter_5 import REASONS
 
@@ -32,7 +32,7 @@ def name_of(target: Target, level: str) -> str:
     return f"{view_of(target.range)}{target.metric}_{target.iou:g}_{level}"
 
 
-def evaluation_of(labels: Objects, detections: Objects, rule: DifficultyRule) -> Evaluation:
+def evaluation_of(labels: Objects, detections: Objects, rule: DifficultyRule, recall: RecallPoints = 40) -> Evaluation:
     """Car in 3D and from above at IoU 0.7 and 0.5, everywhere and per range of distance."""
     return prepare(
         dict(labels),
@@ -42,6 +42,7 @@ def evaluation_of(labels: Objects, detections: Objects, rule: DifficultyRule) ->
         ious={"Car": IOUS},
         ranges=RANGES,
         difficulty=rule,
+        recall=recall,
         missing="empty",
     )
 

@@ -26,6 +26,7 @@ KINDS: dict[str, str] = {
     "completion": "pipeline.experiments.completion_runs",
     "analysis": "pipeline.experiments.analysis_runs",
     "detection": "pipeline.experiments.detection_runs",
+    "frustum": "pipeline.experiments.frustum_runs",
     "cloud": "pipeline.experiments.cloud_runs",
     "completer": "pipeline.experiments.bundled_runs",
     "selection": "pipeline.experiments.bundled_runs",
