@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--architecture",
         required=True,
         metavar="NAME",
-        help="twise, twise_maxpool, msg_chn, msg_chn_wacv, sparse_to_dense, nlspn; pointrcnn, epnet, "
+        help="twise, twise_maxpool, msg_chn, msg_chn_wacv, sparse_to_dense, nlspn, enet, penet; pointrcnn, epnet, "
         "openpcdet_pointrcnn, pointpillar, second, voxel_rcnn, pv_rcnn, frustum_pointnet; efficientnet_lite0 (backbone "
         "to train a segmentation network on); or 'results' for a result pickle",
     )
@@ -47,8 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="NAME=VALUE",
         help="what the file does not tell, repeatable; nlspn: legacy and preserve_input, both true for the authors' "
-        "released weights, and affinity (AS, ASS, TC, TGASS), iterations (18); frustum_pointnet: variant, tf (the "
-        "original) or port",
+        "released weights, and affinity (AS, ASS, TC, TGASS), iterations (18); enet, penet: crop "
+        "(bottom, top_left) and camera (published, frame); frustum_pointnet: variant, tf (the original) or port",
     )
     out = "NAME.safetensors, or the folder of result files"
     parser.add_argument("--out", type=Path, required=True, metavar="FILE|DIR", help=out)
