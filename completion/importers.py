@@ -119,7 +119,9 @@ def _prepare(
 def fitting_architectures(tensors: Mapping[str, Tensor]) -> tuple[str, ...]:
     """The architectures whose networks have exactly these tensors; those that must be asked for choices left out."""
     found = []
-    for architecture, spec in SPECS.items():
+    tensors = without_unused(tensors)
+    unasked = {name: partial(penet_spec, name, choices={}) for name in ("enet", "penet")}
+    for architecture, spec in {**SPECS, **unasked}.items():
         try:
             with torch.device("meta"):
                 compared = match(build_model(spec(tensors)), tensors)

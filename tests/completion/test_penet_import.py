@@ -13,6 +13,7 @@ import torch
 
 from auglidar_base.errors import CheckpointError, SettingsError
 from completion.checkpoints import import_checkpoint, load_checkpoint
+from completion.importers import fitting_architectures
 from completion.infer import load_completer
 from completion.models.enet import ENet
 from completion.models.penet import PENet
@@ -154,6 +155,9 @@ def test_a_file_that_does_not_fit_is_one_clear_line(tmp_path: Path) -> None:
         import_checkpoint(save(tmp_path, penet), "enet")
     with pytest.raises(CheckpointError, match="weights of enet, not of penet; import them as 'enet'"):
         import_checkpoint(save(tmp_path, enet), "penet")
+    with pytest.raises(CheckpointError, match="penet"):
+        import_checkpoint(save(tmp_path, penet), "twise")
+    assert (fitting_architectures(enet), fitting_architectures(penet)) == (("enet",), ("penet",))
     del penet["mask_layer_s2.0.weight"]
     penet["kernel_conf_layer.0.weight"] = torch.zeros(3, 5, 3, 3)
     with pytest.raises(
