@@ -120,11 +120,10 @@ def fitting_architectures(tensors: Mapping[str, Tensor]) -> tuple[str, ...]:
     """The architectures whose networks have exactly these tensors; those that must be asked for choices left out."""
     found = []
     tensors = without_unused(tensors)
-    unasked = {name: partial(penet_spec, name, choices={}) for name in ("enet", "penet")}
-    for architecture, spec in {**SPECS, **unasked}.items():
+    for architecture in (*SPECS, "enet", "penet"):
         try:
             with torch.device("meta"):
-                compared = match(build_model(spec(tensors)), tensors)
+                compared = match(build_model(_spec(architecture, tensors, {})), tensors)
         except (CheckpointError, SettingsError, RuntimeError):
             continue  # Its sizes cannot be read from these tensors, so it is another network.
         counters_only = all(name.endswith("num_batches_tracked") for name in compared.missing)

@@ -31,7 +31,7 @@ NOT_RUN = {
     r"--stage train|--stage synth|runs/trained": "trains for minutes to hours: tests/pipeline/test_training*.py",
     r"--stage experiment": "a study of hours; plans and smoke runs: tests/pipeline/experiments",
     r"--stage bench|-m benchmarks|-m timeit": "measures for minutes: tests/pipeline/benchmark, tests/benchmarks",
-    r"\.(tar|pth|pt) |result\.pkl|weights/(twise|pointrcnn|penet)|runs/penet": "needs a published file: test_*import*.py",
+    r"\.(tar|pth|pt) |result\.pkl|/(twise|pointrcnn|penet)": "needs a published file: test_importers.py",
     r"--leakage": "needs KITTI's devkit: tests/pipeline/check/test_leakage.py",
     r"^python -m pytest|-m tests\.": "tests of their own",
     r"^python -m pipeline\.|^python (docs|scripts)/": "makes figures, pages or weights",
