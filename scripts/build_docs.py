@@ -1,7 +1,7 @@
 """Builds the documentation as a static site that opens without a server or a network: python scripts/build_docs.py
 
 docs/*.md, the notebooks, CONTRIBUTING.md, CHANGELOG.md, RELEASING.md and an API reference made from the docstrings go
-to build/docs;
+to build/docs, with llms.txt, a list of the pages for programs that read them (llmstxt.org);
 Zensical (extra `docs`) turns them into site/. `--sources-only` stops before Zensical.
 """
 
@@ -115,8 +115,41 @@ def write_sources(out: Path) -> None:
         (out / "api" / f"{room}.md").write_text(api_page(room, modules), encoding="utf-8")
     for page in out.glob("*.md"):
         page.write_text(inside_links(page.read_text(encoding="utf-8")), encoding="utf-8")
+    (out / "llms.txt").write_text(list_of_pages(out), encoding="utf-8")
     for page in out.rglob("*.md"):
         page.write_text(opening_pictures(whole_options(page.read_text(encoding="utf-8"))), encoding="utf-8")
+
+
+def list_of_pages(out: Path) -> str:
+    """llms.txt: the project's title and first sentence, then the menu with every page's title and first sentence."""
+    menu = (ROOT / "zensical.toml").read_text(encoding="utf-8")
+    front = (out / "index.md").read_text(encoding="utf-8")
+    lines = [f"# {title_of(front)}", "", f"> {first_sentence(front)}"]
+    for entry_name, page in re.findall(r'\{ "([^"]+)" = (?:"([^"]+)"|\[)', menu):
+        if not page:
+            lines += ["", f"## {entry_name}", ""]
+        elif page != "index.md":
+            text = (out / page).read_text(encoding="utf-8")
+            if lines[-1].startswith(">"):
+                lines.append("")
+            lines.append(f"- [{title_of(text)}]({page.removesuffix('.md')}.html): {first_sentence(text)}")
+    return "\n".join(lines) + "\n"
+
+
+def title_of(page: str) -> str:
+    """The text of the first heading."""
+    return re.search(r"^# (.+)$", page, re.MULTILINE)[1].strip()  # type: ignore[index]
+
+
+def first_sentence(page: str) -> str:
+    """The first sentence of prose of a page, in one line and without links; "" when there is none."""
+    text = re.sub(r"^```.*?^```|<!--.*?-->", "", page, flags=re.MULTILINE | re.DOTALL)
+    prose = [part for part in text.split("\n\n") if re.match(r"[\w`*(\[]", part.strip())]
+    if not prose:
+        return ""
+    line = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", " ".join(prose[0].split()))
+    sentence = re.match(r".+?(?:[.?](?= [A-Z`\[*])|[.:?]$)", line)
+    return re.sub(":$", ".", sentence[0]) if sentence else line
 
 
 def inside_links(text: str) -> str:
@@ -185,7 +218,8 @@ def output_text(output: dict[str, Any]) -> str:
 
 def api_page(room: str, modules: tuple[str, ...]) -> str:
     """The reference of one room: signature and docstring of every public class and function."""
-    parts = [f"# API: {room}", "Made from the docstrings. Depth and coordinates are metres unless said otherwise."]
+    about = f"The public classes and functions of `{room}`, made from the docstrings."
+    parts = [f"# API: {room}", f"{about} Depth and coordinates are metres unless said otherwise."]
     for name in modules:
         module = import_module(name)
         parts += [f"## `{name}`", as_text(inspect.getdoc(module) or "")]

@@ -233,8 +233,28 @@ def test_reference_covers_what_users_import(tmp_path: Path) -> None:
     for name in ("load_completer", "depth_metrics", "import_checkpoint", "furthest_point_sample", "evaluate",
                  "augment_frame", "open_dataset", "project_points"):  # fmt: skip
         assert f"### `{name}`" in reference, name
+    check_list_of_pages(tmp_path / "docs")
     pages_of_site = [*(tmp_path / "docs").glob("*.md")]
     assert not [page.name for page in pages_of_site if "](../" in page.read_text(encoding="utf-8")]
+
+
+def check_list_of_pages(built: Path) -> None:
+    """llms.txt: a title, a sentence, and one line with a sentence for every page of the site but the front page."""
+    lines = (built / "llms.txt").read_text(encoding="utf-8").splitlines()
+    assert lines[0] == "# AugLiDAR"
+    assert lines[2].startswith("> Sparse LiDAR and one camera image in; dense depth")
+    listed = dict(re.findall(r"^- \[[^\]]+\]\(([^)]+)\.html\): (.*)$", "\n".join(lines), re.MULTILINE))
+    menu = set(re.findall(r'"([^"]+)\.md"', (ROOT / "zensical.toml").read_text(encoding="utf-8")))
+    assert set(listed) == menu - {"index"}
+    wrong = [
+        f"{page}: {text}" for page, text in listed.items() if len(text) < 20 or text[-1] not in ".?" or "](" in text
+    ]
+    assert wrong == []
+    assert (
+        listed["cluster"]
+        == "A run on n machines is n processes with `--shard i/n`, counted from 0, and one shared folder."
+    )
+    assert {"## Tasks", "## Reference", "## Understand"} <= set(lines)
 
 
 def test_citation_is_complete() -> None:

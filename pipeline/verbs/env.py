@@ -1,4 +1,7 @@
-"""`--stage env`: what this installation runs on, to read before a long job or to paste into a report of a problem."""
+"""`--stage env`: what this installation runs on, to read before a long job or to paste into a report of a problem.
+
+Nothing of what is reported on is imported: the report comes at once, and also where PyTorch or Open3D cannot be loaded.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import importlib.util
 import json
 import os
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -83,15 +87,16 @@ def remarks(found: dict[str, Any]) -> list[str]:
     available = found["memory_gb"]["available"]
     if available is not None and available < 1.5 * found["cores"]:
         notes.append(f"{available:.1f} GB of memory free for {found['cores']} processes; give fewer --workers")
+    torch = found["versions"].get("torch") or ""
+    if found["gpus"] and torch.endswith("+cpu"):
+        notes.append(f"PyTorch {torch} is the build for CPUs; training on the GPU needs a build with CUDA")
     if not found["weights"]["detection"]:
         notes.append("no detector is bundled; give one as detection.model, or stop at --stage augment")
     return notes
 
 
-def _threads() -> dict[str, Any]:
-    import torch
-
-    return {"torch": torch.get_num_threads(), **{name: os.environ.get(name) for name in THREAD_VARIABLES}}
+def _threads() -> dict[str, str | None]:
+    return {name: os.environ.get(name) for name in THREAD_VARIABLES}
 
 
 def _memory() -> dict[str, float | None]:
@@ -116,9 +121,13 @@ def _disk(folder: Path) -> dict[str, Any]:
 
 
 def _gpus() -> list[str]:
-    import torch
-
-    return [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())]
+    """Names of NVIDIA's GPUs, as the driver's own tool lists them; empty without a driver."""
+    try:
+        command = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return []
+    return [line.strip() for line in done.stdout.splitlines() if line.strip()]
 
 
 def as_text(found: dict[str, Any]) -> str:

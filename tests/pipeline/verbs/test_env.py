@@ -36,10 +36,12 @@ def test_remarks_name_the_trouble(tmp_path: Path) -> None:
     found["disk"]["free_gb"] = 0.4
     found["memory_gb"]["available"] = 0.5
     found["weights"]["detection"] = []
+    found["versions"]["torch"], found["gpus"] = "2.13.0+cpu", ["NVIDIA H200"]
     notes = remarks(found)
     assert any("0.4 GB free" in note for note in notes)
     assert any("fewer --workers" in note for note in notes)
     assert any("detection.model" in note for note in notes)
+    assert any("build for CPUs" in note for note in notes)
 
 
 def test_no_remark_without_trouble(tmp_path: Path) -> None:
@@ -47,7 +49,19 @@ def test_no_remark_without_trouble(tmp_path: Path) -> None:
     found["disk"]["free_gb"] = 500.0
     found["memory_gb"]["available"] = 1000.0
     found["weights"]["detection"] = ["small_lidar"]
+    found["gpus"] = []
     assert remarks(found) == []
+
+
+def test_gpus_are_those_of_the_driver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "nvidia-smi"
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert environment(tmp_path)["gpus"] == []
+    program.write_text("#!/bin/sh\nprintf 'NVIDIA H200\\nNVIDIA L4\\n'\n")
+    program.chmod(0o755)
+    assert environment(tmp_path)["gpus"] == ["NVIDIA H200", "NVIDIA L4"]
+    program.write_text("#!/bin/sh\nexit 9\n")
+    assert environment(tmp_path)["gpus"] == []
 
 
 def completions(*words: str) -> set[str]:
