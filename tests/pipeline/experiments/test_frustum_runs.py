@@ -7,10 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from completion.types import CompletedDepth
 from detection.evaluation.difficulty import KittiDifficulty
-from detection.kitti_format import KittiObject
+from detection.frustum.infer import FrustumDetector
+from detection.frustum.network import FrustumPointNet
+from detection.frustum.regions import object_regions
+from detection.frustum.samples import frame_samples
+from detection.kitti_format import KittiObject, format_line, parse_line
 from pipeline.base.errors import DataError, UsageError
 from pipeline.cli import main
 from pipeline.data import open_dataset
@@ -151,3 +156,18 @@ def test_a_configuration_names_boxes_and_completers(tmp_path: Path) -> None:
     path.write_text('table: "3.4"\nfrustum:\n  boxes: val.txt\n  completers: {ma: a.safetensors}\n')
     budget = budget_of("frustum", "paper", read_config(path).changes)
     assert (budget.boxes, dict(budget.completers)) == ("val.txt", {"ma": "a.safetensors"})
+
+
+def test_real_frames_give_frustums_and_result_lines(kitti_object: Path, tmp_path: Path) -> None:
+    frames = FrustumFrames(open_dataset("kitti_object", kitti_object), 64, None, tmp_path)
+    torch.manual_seed(0)
+    detector = FrustumDetector(FrustumPointNet("tf", 3).eval(), torch.device("cpu"))
+    frame, labels = frames[3]
+    (sample,) = frame_samples(frame, labels, 3)
+    # A box hugs its car: most points of the frustum are the object's, at the labelled distance.
+    assert sample.type == "Car"
+    assert sample.mask.mean() > 0.5
+    distance = np.median(sample.points[sample.mask, 2])
+    assert abs(float(distance) - float(sample.centre[2])) < 2.5
+    (found,) = detector.detect(frame, object_regions(labels))
+    assert parse_line(format_line(found), scored=True).bbox == pytest.approx(labels[0].bbox, abs=0.01)
