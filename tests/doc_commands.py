@@ -33,7 +33,7 @@ NOT_RUN = {
     r"--stage bench|-m benchmarks|-m timeit": "measures for minutes: tests/pipeline/benchmark, tests/benchmarks",
     r"\.(tar|pth|pt) |result\.pkl|/(twise|pointrcnn|penet)": "needs a published file: test_importers.py",
     r"--leakage": "needs KITTI's devkit: tests/pipeline/check/test_leakage.py",
-    r"^python -m pytest|-m tests\.": "tests of their own",
+    r"^python -m pytest|^scripts/test|-m tests\.": "tests of their own",
     r"^python -m pipeline\.|^python (docs|scripts)/": "makes figures, pages or weights",
 }
 

@@ -67,7 +67,8 @@ class AugmentStage(FrameStage):
         of_masks = {None: (), "truth": ("semantics",), "boxes": ("labels", *size), "files": size}.get(
             self.mask_kind, image
         )
-        return *lidar_parts(frame), *of_masks, *(size if self.depth_from is not None else ())
+        compared = ("sparse_depth", *frame.sources("sparse_depth")) if self.compare else ()
+        return *lidar_parts(frame), *of_masks, *((*size, *compared) if self.depth_from is not None else ())
 
     def reads(self) -> tuple[str, ...]:
         """This run's completed depth."""
