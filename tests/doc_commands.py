@@ -20,8 +20,8 @@ PROGRAMS = ("run_pipeline", "make", "python", "pip", "ray", "srun", "torchrun", 
 
 # The order in which a reader would come to them: later pages use what earlier ones made.
 STORY = (
-    "start.md", "kitti.md", "README.md", "index.md", "virtual-points.md", "other-networks.md", "noise.md", "cluster.md",
-    "report.md", "doctor.md", "data.md", "evaluation.md", "export.md", "train.md",
+    "start.md", "kitti.md", "README.md", "index.md", "virtual-points.md", "other-networks.md", "own-methods.md",
+    "noise.md", "cluster.md", "report.md", "doctor.md", "data.md", "evaluation.md", "export.md", "train.md",
 )  # fmt: skip
 
 # Pattern of a command -> why it is not run here.

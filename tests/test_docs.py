@@ -132,7 +132,7 @@ def test_named_functions_exist(page: Path) -> None:
     for code in re.findall(r"`([^`\n]+)`", prose(page)):
         name = re.match(rf"((?:{'|'.join(ROOMS[:4])})(?:\.\w+)+)", code)
         # completion.model and the like are keys of the configuration.
-        if name is None or name.group(1).split(".")[1] in ("model", "device", "backend"):
+        if name is None or name.group(1).split(".")[1] in ("model", "device", "backend", "options"):
             continue
         assert resolves(name.group(1)), f"{page.name}: {name.group(1)} does not exist"
 

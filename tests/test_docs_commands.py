@@ -57,6 +57,9 @@ def prepare(name: str, desk: Path) -> None:
     """What the page says one has by now."""
     if name == "other-networks.md":
         shutil.copytree(desk / "runs" / "kitti" / "depth", desk / "DEPTH")
+    if name == "own-methods.md":
+        (code,) = re.findall(r"^```python\n(.*?)^```", page(name).read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+        (desk / "my_methods.py").write_text(code)
     if name == "report.md":
         for copy in ("augmented", "lidar_only"):
             shutil.copytree(desk / "runs" / "kitti", desk / "runs" / copy)

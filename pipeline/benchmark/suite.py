@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from completion.infer import Completer, load_completer
+from completion.infer import Completer
 from completion.models.classical import ClassicalCompleter
-from detection.infer import load_detector
 from detection.kitti_format import KittiObject
 from detection.results import result_objects
 from detection.types import PointFrame
@@ -21,6 +20,8 @@ from pipeline.benchmark.held_out_rings import BEAM_STRIDES, hold_out, score
 from pipeline.benchmark.object_recall import RecallReport, object_recall
 from pipeline.data import Dataset, Frame
 from pipeline.pointcloud.presets import PRESETS
+from pipeline.run_folder.completers import open_completer
+from pipeline.run_folder.detectors import open_detector
 from pipeline.run_folder.thresholds import ScoreThresholds
 from pipeline.training.thinned_clouds import thinned_cloud
 
@@ -50,7 +51,7 @@ def completion_scores(
 ) -> list[dict[str, Any]]:
     """Mean scores over frames, one entry per method and number of rows; see `held_out_rings.score` for the keys.
 
-    names  "nearest", "classical" (linear in inverse depth), or weights as `load_completer` takes them
+    names  "nearest", "classical" (linear in inverse depth), or weights or module:Class as `open_completer` takes them
     """
     methods = [(name, _method(name)) for name in names]
     if not methods:
@@ -70,7 +71,7 @@ def completion_scores(
 
 
 def _method(name: str) -> Callable[[NDArray[np.float32], NDArray[np.uint8]], NDArray[np.float32]]:
-    completer: Completer = ClassicalCompleter("nearest") if name == "nearest" else load_completer(name, backend="auto")
+    completer: Completer = ClassicalCompleter("nearest") if name == "nearest" else open_completer(name, backend="auto")
     return lambda sparse, image: completer.complete(sparse, image).depth
 
 
@@ -87,10 +88,10 @@ def _means(entries: list[dict[str, float]]) -> dict[str, Any]:
 
 def detection_scores(dataset: Dataset, rows: Iterable[DetectionRow], completer: str, progress: Progress) -> list[Any]:
     """Recall and precision of every class for every row, from above and in 3D at two overlaps (`IOUS`)."""
-    complete = load_completer(completer, backend="auto")
+    complete = open_completer(completer, backend="auto")
     results = []
     for row in rows:
-        detector = load_detector(row.detector, seed=0)
+        detector = open_detector(row.detector, seed=0)
         labels, detections = [], []
         for frame_id in dataset.ids:
             frame = dataset[frame_id]

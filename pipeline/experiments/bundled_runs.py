@@ -1,7 +1,7 @@
 """Runs of kinds "completer" (score one that is there) and "selection" (train the bundled network, then score it).
 
-Settings: `completer`, a name for `completion.infer.load_completer`; or `loss` ("mixture" or "l2"), `width` and `start`
-(weights to grow from, "" for none). Scores are those of the completion tables, at 64 and 16 rows: "64/mae_mm", ...
+Settings: `completer`, a name for `completers.open_completer`, and its `options`; or `loss` ("mixture", "l2"), `width`
+and `start` (weights to grow from, "" for none). Scores: those of the completion tables at 64 and 16 rows, "64/mae_mm".
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def _steps(recipe: Recipe, budget: BundledBudget) -> int:
 
 def run(recipe: Recipe, context: Context) -> Outcome:
     """Scores a completer, trained first where the recipe says so; a killed training continues."""
-    from completion.infer import load_completer
+    from pipeline.run_folder.completers import open_completer
 
     budget: BundledBudget = context.budget
     world = open_world(
@@ -90,7 +90,8 @@ def run(recipe: Recipe, context: Context) -> Outcome:
     name: str | Path = str(recipe.settings.get("completer", ""))
     if recipe.kind == "selection":
         name = _trained(recipe, world.train, context)
-    return score(load_completer(name, backend="auto"), world.test)
+    options = recipe.settings.get("options") or {}
+    return score(open_completer(str(name), backend="auto", options=options), world.test)
 
 
 def train_settings(recipe: Recipe, budget: BundledBudget, seed: int) -> TrainSettings:

@@ -18,7 +18,9 @@ from pipeline.base.errors import DataError, UsageError
 from pipeline.base.paths import RunFolder, safe_id
 from pipeline.data import Dataset, Frame
 from pipeline.experiments.inputs import InputCloud, InputRecipe, lidar_points, make_input
+from pipeline.run_folder.completers import open_completer
 from pipeline.run_folder.frame_outputs import FrameOutputs
+from pipeline.run_folder.own_methods import is_own, own_version
 
 if TYPE_CHECKING:
     from completion.infer import Completer
@@ -35,9 +37,7 @@ def short_hash(values: object) -> str:
 
 @lru_cache(maxsize=2)
 def _completer(network: str) -> Completer:
-    from completion.infer import load_completer
-
-    return load_completer(network)
+    return open_completer(network)
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,10 @@ class DepthCache:
 
     def name(self, depth: str, rows: int) -> str:
         """Folder of a kind of depth at a number of LiDAR rows."""
-        return f"depth-{Path(self.network).stem if depth == 'completed' else depth}-{rows}"
+        network = self.network if depth == "completed" else depth
+        if is_own("completion", network):
+            return f"depth-own-{own_version('completion', network, {})}-{rows}"
+        return f"depth-{Path(network).stem if depth == 'completed' else depth}-{rows}"
 
     def of(self, frame: Frame, depth: str, rows: int) -> CompletedDepth:
         """The depth of a frame, completed now if it is not there. UsageError when the data set has no dense truth."""

@@ -2,7 +2,8 @@
 
 Settings of a recipe: network, loss, gamma, rows (64, 32, 16, 8, 0 = monocular), colour, target ("clean" or
 "semi_dense": what it is trained on), scene ("street", or "samples_500": random samples in place of LiDAR rows); or
-compare: two "network loss" names whose pixel errors are compared; or audit: the semi-dense ground truth is measured.
+compare: two "network loss" names whose pixel errors are compared; or audit: the semi-dense ground truth is measured; or
+completer: module:Class with `options`, a method of one's own, which is scored as it is.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ def cost(recipe: Recipe, budget: CompletionBudget) -> Cost:
     """Steps and test frames by the measured seconds of the network; data once."""
     frames = budget.train_frames + budget.test_frames
     seconds, size = frames * budget.seconds_per_data_frame, frames * 13.0 * _pixels(budget)
-    if "network" not in recipe.settings:
+    if "network" not in recipe.settings or "completer" in recipe.settings:
         return Cost(budget.test_frames * 0.2, 1e6, seconds, size)
     name = cost_name(recipe)
     train, test = budget.seconds_per_step.get(name, 0.0), budget.seconds_per_test_frame.get(name, 0.0)
@@ -78,6 +79,8 @@ def run(recipe: Recipe, context: Context) -> Outcome:
         return audit(context)
     from pipeline.experiments.scoring import completers, save_examples, score
 
+    if "completer" in recipe.settings:
+        return _score_own(recipe, context)
     _check(recipe, context.budget)
     noisy = ("train", "test") if recipe.settings["target"] == "semi_dense" else ()
     train_paths, test_paths = stored.ensure_frames(context.out, context.data, context.budget, context.say, noisy)
@@ -88,6 +91,18 @@ def run(recipe: Recipe, context: Context) -> Outcome:
     by_decoding = completers(model, settings.model, default_decoding(settings.model))
     save_examples(context.folder, next(iter(by_decoding.values())), tests)
     return score(by_decoding, tests, DIAGNOSED)
+
+
+def _score_own(recipe: Recipe, context: Context) -> Outcome:
+    """A method of one's own on the test frames: nothing is trained."""
+    from pipeline.experiments.scoring import save_examples, score
+    from pipeline.run_folder.completers import open_completer
+
+    completer = open_completer(str(recipe.settings["completer"]), options=recipe.settings.get("options"))
+    _, test_paths = stored.ensure_frames(context.out, context.data, context.budget, context.say)
+    tests = [test_frame(recipe, path) for path in test_paths]
+    save_examples(context.folder, completer, tests)
+    return score({"own": completer}, tests, DIAGNOSED)
 
 
 def _check(recipe: Recipe, budget: CompletionBudget) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 from pipeline.base.errors import UsageError
 from pipeline.base.settings import nearest_name
 from pipeline.base.yaml_files import read_yaml
+from pipeline.experiments.further_rows import FurtherRow, read_rows
 from pipeline.experiments.runs import BUDGET_NAMES, KINDS
 
 
@@ -21,16 +22,17 @@ class ExperimentConfig:
     budget: str
     seeds: int
     changes: Mapping[str, Mapping[str, Any]]
+    rows: tuple[FurtherRow, ...] = ()
 
 
 def read_config(path: Path) -> ExperimentConfig:
     """A file of configs/experiments. UsageError in one line for what is wrong in it.
 
-    Keys: table and figure (a number or a list of them, as text), budget, seeds, and a section per kind of run whose
-    keys replace those of its budget.
+    Keys: table and figure (a number or a list of them, as text), budget, seeds, rows (see `further_rows`), and a
+    section per kind of run whose keys replace those of its budget.
     """
     tree = read_yaml(path)
-    known = ("table", "figure", "budget", "seeds", *KINDS)
+    known = ("table", "figure", "budget", "seeds", "rows", *KINDS)
     for key in tree:
         if key not in known:
             raise UsageError(f"{path}: unknown key {key!r}; {nearest_name(str(key), known)}")
@@ -40,7 +42,8 @@ def read_config(path: Path) -> ExperimentConfig:
     if not isinstance(seeds, int) or seeds < 1:
         raise UsageError(f"{path}: seeds: expected 1 or more, got {seeds!r}")
     wanted = [(kind, number) for kind in ("table", "figure") for number in _numbers(tree, kind, path)]
-    return ExperimentConfig(wanted, budget, seeds, {kind: _section(tree, kind, path) for kind in KINDS})
+    changes = {kind: _section(tree, kind, path) for kind in KINDS}
+    return ExperimentConfig(wanted, budget, seeds, changes, read_rows(tree.get("rows", []), str(path)))
 
 
 def _numbers(tree: Mapping[str, Any], kind: str, path: Path) -> list[str]:

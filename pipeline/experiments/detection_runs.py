@@ -1,7 +1,8 @@
 """Runs of kind "detection": clouds of a recipe, a detector trained on them, its AP on clouds of the test frames.
 
 Settings of a recipe: `input` (fields of `InputRecipe`), `detector` (a name in the budget), `rows` (LiDAR rows), and
-`test_input` (fields that differ in the test clouds: train clean, test noisy).
+`test_input` (fields that differ in the test clouds: train clean, test noisy). A `detector` may be module:Class with
+`options`, a detector of one's own: it is tested as it is.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ from pipeline.experiments.runs import Context, Cost, Outcome
 from pipeline.experiments.tables import Recipe
 from pipeline.experiments.worlds import World, open_world, world_identity
 from pipeline.pointcloud.taxonomy import LABELS
+from pipeline.run_folder.detectors import ObjectDetector, open_detector
 from pipeline.run_folder.frame_outputs import FrameOutputs
+from pipeline.run_folder.own_methods import is_own
 
 if TYPE_CHECKING:
     from detection.kitti_format import KittiObject
@@ -50,7 +53,7 @@ class DetectionRecipe:
     @classmethod
     def of(cls, settings: Mapping[str, Any]) -> DetectionRecipe:
         """From the settings of a recipe. UsageError for an unknown field."""
-        known = ("input", "detector", "rows", "test_input")
+        known = ("input", "detector", "rows", "test_input", "options")
         for key in settings:
             if key not in known:
                 raise UsageError(f"detection recipe: unknown setting {key!r}; {nearest_name(key, known)}")
@@ -67,7 +70,10 @@ def data_identity(data: Path | None, budget: DetectionBudget) -> Any:
 
 def cost(recipe: Recipe, budget: DetectionBudget) -> Cost:
     """Training and detection; frames and completed depth are made once per experiment folder."""
-    choice = detector_choice(DetectionRecipe.of(recipe.settings), budget)
+    wanted = DetectionRecipe.of(recipe.settings)
+    if is_own("detection", wanted.detector):
+        return Cost(budget.test_frames * 0.5, _MEGABYTE, budget.seconds_per_data_frame * budget.test_frames)
+    choice = detector_choice(wanted, budget)
     frames = budget.train_frames + budget.test_frames
     seconds = budget.steps * choice.seconds_per_step * budget.batch / 2 + budget.test_frames * choice.seconds_per_frame
     # Clouds are shared by seeds and detectors: a table has some six kinds of them.
@@ -109,9 +115,10 @@ def run(recipe: Recipe, context: Context) -> Outcome:
     """Trains and tests one detector; continues from what a killed run left in its folder."""
     wanted = DetectionRecipe.of(recipe.settings)
     world = world_of(context)
-    weights = train_detector(wanted, world.train, context)
+    own, options = is_own("detection", wanted.detector), recipe.settings.get("options")
+    name = wanted.detector if own else str(train_detector(wanted, world.train, context))
     clouds = clouds_of(world.test, wanted.test_input, context)
-    labels, detections = detect(weights, clouds, context)
+    labels, detections = detect(open_detector(name, seed=context.seed, options=options), clouds, context)
     write_example(context.folder / "example.npz", clouds, labels, detections)
     evaluation = scores.evaluation_of(labels, detections, world.rule)
     resampling = Resampling(context.budget.resamples)
@@ -184,13 +191,11 @@ def _trained(
 
 
 def detect(
-    weights: Path, clouds: CloudCache, context: Context
+    detector: ObjectDetector, clouds: CloudCache, context: Context
 ) -> tuple[dict[str, list[KittiObject]], dict[str, list[KittiObject]]]:
     """Labels and detections of the test frames by id; those that are there already are read."""
-    from detection.infer import load_detector
     from detection.results import result_objects
 
-    detector = load_detector(weights, seed=context.seed)
     run_folder = RunFolder(context.folder)
     labels, found = {}, {}
     for frame in clouds.dataset:

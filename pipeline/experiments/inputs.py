@@ -18,6 +18,7 @@ from pipeline.geometry.in_view import lidar_pixels, value_at
 from pipeline.pointcloud.presets import PRESETS, AugmentSettings
 from pipeline.pointcloud.semantic_mask import object_score
 from pipeline.pointcloud.taxonomy import CLEAN, Taxonomy, label_noise
+from pipeline.run_folder.own_methods import is_own
 from pipeline.simulation.noise import NoiseSettings, add_noise
 
 if TYPE_CHECKING:
@@ -35,7 +36,8 @@ class InputRecipe:
     """One kind of cloud.
 
     preset   settings of the point-cloud stage (`pipeline.pointcloud.presets`); `changes` replaces some of them
-    depth    "completed" by the budget's network, "classical" (no network), "truth", or "semi_dense" pseudo truth
+    depth    "completed" by the budget's network, "classical" (no network), "truth", "semi_dense" pseudo truth,
+             or module:Class, a completion method of one's own
     rows     LiDAR rows: 64, 32, 16, 8, of the raw points and of the completion's input
     noise    added to the depth before anything else (thesis 5.3.2)
     masks    "objects": the budget's source of masks; "boxes": the labelled 2D boxes (Table 5.9)
@@ -51,8 +53,8 @@ class InputRecipe:
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:
             raise SettingsError(f"preset: {nearest_name(self.preset, PRESETS)}, got {self.preset!r}")
-        if self.depth not in DEPTHS:
-            raise SettingsError(f"depth: expected one of {', '.join(DEPTHS)}, got {self.depth!r}")
+        if self.depth not in DEPTHS and not is_own("completion", self.depth):
+            raise SettingsError(f"depth: expected one of {', '.join(DEPTHS)} or module:Class, got {self.depth!r}")
         if self.masks not in ("objects", "boxes"):
             raise SettingsError(f"masks: expected 'objects' or 'boxes', got {self.masks!r}")
         if self.rows < 1 or FULL_ROWS % self.rows:

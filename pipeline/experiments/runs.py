@@ -18,6 +18,7 @@ from pipeline.base.errors import UsageError
 from pipeline.base.settings import nearest_name, plain, with_changes
 from pipeline.base.versions import made_with
 from pipeline.experiments.tables import Recipe
+from pipeline.run_folder.own_methods import Room, is_own, own_version
 
 BUDGET_NAMES = ("smoke", "small", "paper")
 
@@ -173,8 +174,27 @@ def plan_run(recipe: Recipe, budget: Any, data: Path | None, seed: int) -> Run:
         "data": module.data_identity(data, budget),
         "seed": seed,
     }
+    own = own_versions(recipe.settings, record["budget"])
+    if own:
+        record["own"] = own
     digest = hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
     return Run(recipe, budget, seed, f"{recipe.kind}-{digest[:16]}")
+
+
+def own_versions(settings: Mapping[str, Any], budget: Mapping[str, Any]) -> list[str]:
+    """Versions of the classes of one's own that a recipe or its budget names: a changed source is another run.
+
+    Raises UsageError for one that cannot be used, before anything is computed.
+    """
+    options = settings.get("options") or {}
+    inputs = [settings.get("input") or {}, settings.get("test_input") or {}]
+    named: list[tuple[Room, Any, Mapping[str, Any]]] = [
+        ("completion", settings.get("completer"), options),
+        ("completion", budget.get("completer"), {}),
+        *(("completion", one.get("depth"), {}) for one in inputs),
+        ("detection", settings.get("detector"), options),
+    ]  # fmt: skip
+    return [own_version(room, name, given) for room, name, given in named if name and is_own(room, str(name))]
 
 
 def read_result(run: Run, out: Path) -> Outcome | None:

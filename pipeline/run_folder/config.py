@@ -60,7 +60,10 @@ class SynthConfig(LibrarySection):
 class CompletionConfig(Section):
     """Depth completion."""
 
-    model: str = Field(default="classical", description="bundled weights by name, a checkpoint file, or 'classical'")
+    model: str = Field(
+        default="classical", description="bundled weights by name, a checkpoint file, 'classical', or module:Class"
+    )
+    options: dict[str, Any] = Field(default={}, description="keyword arguments of a module:Class")
     backend: str = Field(default="torch", description="what computes it: torch, numba, onnxruntime, openvino or auto")
     device: str = Field(default="cpu", description="where torch computes it: cpu, cuda or mps")
 
@@ -82,7 +85,8 @@ class AugmentConfig(LibrarySection):
 class DetectionConfig(Section):
     """The 3D detector."""
 
-    model: str = Field(default="auto", description="bundled weights by name, a checkpoint file, or 'auto' (by preset)")
+    model: str = Field(default="auto", description="weights by name or file, 'auto' (by preset), or module:Class")
+    options: dict[str, Any] = Field(default={}, description="keyword arguments of a module:Class")
     device: str = Field(default="cpu", description="where it is computed: cpu or cuda")
 
 

@@ -16,6 +16,7 @@ from typing import Any
 from detection.kitti_format import KittiObject
 from pipeline.base.errors import UsageError
 from pipeline.run_folder.config import Config
+from pipeline.run_folder.own_methods import is_own, own_class
 from pipeline.run_folder.weights import detection_weights, detector_name
 
 
@@ -39,7 +40,10 @@ class ScoreThresholds:
     def of_run(cls, config: Config) -> ScoreThresholds:
         """Those of the run's detector; everything is shown where there is no card to say more."""
         try:
-            return cls.of_file(detection_weights(detector_name(config))[-1])
+            name = detector_name(config)
+            if is_own("detection", name):
+                return cls.of_card(vars(own_class("detection", name, config.detection.options)))
+            return cls.of_file(detection_weights(name, {})[-1])
         except (UsageError, OSError, ValueError):
             return cls()
 

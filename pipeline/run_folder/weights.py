@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from pipeline.base.errors import UsageError
 from pipeline.run_folder.config import Config
+from pipeline.run_folder.own_methods import is_own, own_files
 from pipeline.semantics.sources import network_choice
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -21,13 +24,17 @@ def bundled_names(room: str) -> list[str]:
     return sorted(path.stem for path in bundled_folder(room).glob("*.safetensors"))
 
 
-def completion_weights(name: str) -> tuple[Path, ...]:
-    """Weights and card of a completion network; nothing for the classical method."""
+def completion_weights(name: str, options: Mapping[str, Any]) -> tuple[Path, ...]:
+    """Weights and card of a network, the source of a class of one's own; nothing for the classical method."""
+    if is_own("completion", name):
+        return own_files("completion", name, options)
     return () if name == "classical" else _files("completion", name, "completion.model", also="classical")
 
 
-def detection_weights(name: str) -> tuple[Path, ...]:
-    """Weights and card of a detector, see `detector_name`."""
+def detection_weights(name: str, options: Mapping[str, Any]) -> tuple[Path, ...]:
+    """Weights and card of a detector, see `detector_name`; the source of a class of one's own."""
+    if is_own("detection", name):
+        return own_files("detection", name, options)
     return _files("detection", name, "detection.model")
 
 

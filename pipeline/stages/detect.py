@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from pipeline.data.frame import Frame
 from pipeline.run_folder.config import Config
+from pipeline.run_folder.detectors import open_detector
 from pipeline.run_folder.frame_outputs import FrameOutputs
 from pipeline.run_folder.preset import uses_raw_lidar
 from pipeline.run_folder.weights import detection_weights, detector_name
@@ -21,6 +23,7 @@ class DetectStage(FrameStage):
 
     detector   weights by name or file
     device     as `detection.infer.load_detector` takes it
+    options    keyword arguments of a class of one's own
     raw_lidar  the sensor's points instead of the augmented cloud
     seed       of the run
     """
@@ -29,15 +32,24 @@ class DetectStage(FrameStage):
     device: str
     raw_lidar: bool
     seed: int
+    options: Mapping[str, Any] = field(default_factory=dict)
 
-    code: ClassVar = ("detection", "completion/types.py", "auglidar_base/torch_pickle.py", *FRAME_CODE)
+    code: ClassVar = (
+        "detection",
+        "completion/types.py",
+        "auglidar_base/torch_pickle.py",
+        "pipeline/run_folder/detectors.py",
+        "pipeline/run_folder/own_methods.py",
+        *FRAME_CODE,
+    )
     seconds: ClassVar = 2.0
     megabytes: ClassVar = 0.01
 
     @classmethod
     def of(cls, config: Config) -> DetectStage:
         """The detection section, and what the detector sees."""
-        return cls(detector_name(config), config.detection.device, uses_raw_lidar(config), config.seed)
+        section = config.detection
+        return cls(detector_name(config), section.device, uses_raw_lidar(config), config.seed, section.options)
 
     def parts(self, frame: Frame) -> tuple[str, ...]:
         """The camera, and the LiDAR when the detector takes that."""
@@ -49,8 +61,8 @@ class DetectStage(FrameStage):
         return () if self.raw_lidar else ("cloud", "counts", "cloud_columns")
 
     def weights(self) -> tuple[Path, ...]:
-        """Network and card."""
-        return detection_weights(self.detector)
+        """Network and card; the source of a class of one's own."""
+        return detection_weights(self.detector, self.options)
 
     def writes(self) -> tuple[str, ...]:
         """KITTI result lines."""
@@ -62,11 +74,10 @@ class DetectStage(FrameStage):
 
     def open(self) -> Work:
         """Loads the detector."""
-        from detection.infer import load_detector
         from detection.results import result_objects
         from detection.types import PointFrame
 
-        detector = load_detector(self.detector, self.device, self.seed)
+        detector = open_detector(self.detector, self.device, self.seed, self.options)
 
         def detect(frame: Frame, files: FrameOutputs) -> None:
             camera = frame.calibration

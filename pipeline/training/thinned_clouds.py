@@ -21,6 +21,7 @@ from pipeline.base.settings import plain
 from pipeline.data import Dataset, Frame
 from pipeline.geometry.project import project_points
 from pipeline.geometry.rings import subsample_rows
+from pipeline.run_folder.completers import open_completer
 from pipeline.run_folder.config import Config
 from pipeline.run_folder.preset import augment_settings, uses_raw_lidar
 from pipeline.run_folder.weights import completion_weights
@@ -108,19 +109,22 @@ class ThinnedClouds:
         """A folder name for everything but frame and rows that a cloud depends on."""
         if uses_raw_lidar(self.config):
             return "L"
-        facts = json.dumps([plain(augment_settings(self.config)), self.config.completion.model, self.config.seed])
-        weights = [path.read_bytes() for path in completion_weights(self.config.completion.model)]
+        section = self.config.completion
+        own = [section.options] if section.options else []
+        facts = json.dumps([plain(augment_settings(self.config)), section.model, self.config.seed, *own])
+        weights = [path.read_bytes() for path in completion_weights(section.model, section.options)]
         return f"{self.config.augment.preset}-{hashlib.sha256(facts.encode() + b''.join(weights)).hexdigest()[:12]}"
 
     def _tools(self) -> tuple[AugmentSettings | None, Completer | None]:
         if uses_raw_lidar(self.config):
             return None, None
         completion = self.config.completion
-        return augment_settings(self.config), _completer(completion.model, completion.device, completion.backend)
+        options = json.dumps(completion.options, sort_keys=True)
+        return augment_settings(self.config), _completer(
+            completion.model, completion.device, completion.backend, options
+        )
 
 
 @lru_cache(maxsize=1)
-def _completer(name: str, device: str, backend: str) -> Completer:
-    from completion.infer import load_completer
-
-    return load_completer(name, device, backend)
+def _completer(name: str, device: str, backend: str, options: str) -> Completer:
+    return open_completer(name, device, backend, json.loads(options))

@@ -35,8 +35,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--data", required=True, metavar="DIR", help="KITTI object folder (training/velodyne, image_2, calib, label_2)")
     add("--frames", metavar="FILE|a:b|ids", help="split file, positions, or ids separated by commas")
     add("--rows", default="32,16,8", metavar="N,N", help="LiDAR rows given to completion (default: 32,16,8)")
-    add("--completers", metavar="NAME,NAME", help="methods (default: nearest, classical, all bundled); '' for none")
-    add("--detectors", metavar="NAME,NAME", help="detectors (default: all bundled); '' for none")
+    add(
+        "--completers",
+        metavar="NAME,NAME",
+        help="nearest, classical, bundled (all of them), names, files, module:Class (default: the first three)",
+    )
+    add(
+        "--detectors",
+        metavar="NAME,NAME",
+        help="bundled (every bundled one), names, files, module:Class (default: bundled); '' for none",
+    )
     add(
         "--masks",
         metavar="NAME,NAME",
@@ -80,6 +88,8 @@ def run(args: argparse.Namespace) -> int:
     found: dict[str, Any] = {"frames": len(dataset), "completion": completion_scores(dataset, names, rows, progress)}
     if detectors and labelled:
         best = [name for name in names if name not in WITHOUT_WEIGHTS] or ["classical"]
+        found["detection_depth"] = best[-1]
+        progress(f"augmented clouds of the detectors are made from the depth of {best[-1]}")
         found["detection"] = detection_scores(dataset, detectors, best[-1], progress)
     if masks and labelled:
         found["masks"] = mask_scores(dataset, masks, progress)
@@ -97,29 +107,48 @@ def _completers(chosen: str | None) -> list[str]:
     """The methods asked for. Raises CheckpointError for weights that do not exist."""
     from completion.checkpoints import find_weights
     from pipeline.benchmark.suite import WITHOUT_WEIGHTS
+    from pipeline.run_folder.own_methods import is_own, own_class
     from pipeline.run_folder.weights import bundled_names
 
     if chosen is None:
         return [*WITHOUT_WEIGHTS, *bundled_names("completion")]
-    names = [name for name in chosen.split(",") if name]
+    names = _names(chosen, "completion")
     for name in names:
-        if name not in WITHOUT_WEIGHTS:
+        if is_own("completion", name):
+            own_class("completion", name, {})
+        elif name not in WITHOUT_WEIGHTS:
             find_weights(name)
     return names
+
+
+def _names(chosen: str, room: str) -> list[str]:
+    """The parts of a,b,c, each once; `bundled` stands for the names of all bundled networks."""
+    from pipeline.run_folder.weights import bundled_names
+
+    parts = [part.strip() for part in chosen.split(",") if part.strip()]
+    return list(
+        dict.fromkeys(name for part in parts for name in (bundled_names(room) if part == "bundled" else [part]))
+    )
 
 
 def _detection_rows(chosen: str | None, threshold: float | None) -> list[Any]:
     """Every detector on the clouds it was trained for, at 64 and at 16 rows."""
     from detection.checkpoints import find_weights, read_card
     from pipeline.benchmark.suite import DetectionRow
+    from pipeline.pointcloud.presets import PRESETS
+    from pipeline.run_folder.own_methods import is_own, own_class
     from pipeline.run_folder.thresholds import ScoreThresholds
-    from pipeline.run_folder.weights import bundled_names
 
-    names = bundled_names("detection") if chosen is None else [name for name in chosen.split(",") if name]
     rows = []
-    for name in names:
-        card = read_card(find_weights(name))
+    for name in _names("bundled" if chosen is None else chosen, "detection"):
+        if is_own("detection", name):
+            # A class says by `cloud` and `score_thresholds` what a card says of weights.
+            card = dict(vars(own_class("detection", name, {})))
+        else:
+            card = read_card(find_weights(name))
         preset = str(card.get("cloud", "L"))
+        if preset not in PRESETS:
+            raise UsageError(f"{name}: cloud: expected one of {', '.join(PRESETS)}, got {preset!r}")
         least = ScoreThresholds.of_card(card) if threshold is None else ScoreThresholds({}, threshold)
         rows += [DetectionRow(name, preset, number, least) for number in (64, 16)]
     return rows
@@ -144,7 +173,8 @@ def _completion_table(found: dict[str, Any]) -> list[str]:
 
 
 def _detection_table(found: dict[str, Any]) -> list[str]:
-    lines = [f"Objects found, {found['frames']} frames (found/labelled; precision)", ""]
+    about = f"{found['frames']} frames, augmented clouds from {found['detection_depth']}"
+    lines = [f"Objects found, {about} (found/labelled; precision)", ""]
     lines += ["| detector | cloud | rows | class | overlap | easy | moderate | hard | precision | false |"]
     lines += ["|" + "---|" * 10]
     for entry in found["detection"]:

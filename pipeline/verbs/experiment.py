@@ -64,6 +64,7 @@ def read_order(args: argparse.Namespace) -> Order:
     """Tables, budget and seeds of the options and of the configuration; options win. UsageError for none or unknown."""
     from pipeline.experiments.catalogue import find
     from pipeline.experiments.config import read_config
+    from pipeline.experiments.further_rows import with_rows
     from pipeline.experiments.plan import Order
     from pipeline.run_folder.config import config_path
 
@@ -74,6 +75,8 @@ def read_order(args: argparse.Namespace) -> Order:
     if not wanted:
         raise UsageError("expected --table N, --figure N, --config FILE or --list; see --stage experiment --help")
     tables = tuple(find(kind, number) for kind, number in dict.fromkeys(wanted))
+    if config is not None:
+        tables = with_rows(tables, config.rows)
     if args.rows is not None:
         tables = tuple(table.with_lidar_rows(args.rows) for table in tables)
     data = Path(args.data).resolve() if args.data else None

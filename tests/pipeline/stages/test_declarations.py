@@ -67,7 +67,7 @@ def declared(case: Case) -> dict[str, list[Any]]:
 # Written out, so that an item that vanishes from a declaration fails here too.
 DECLARED = {
     "complete": {
-        "settings": {"model", "device", "backend"},
+        "settings": {"model", "device", "backend", "options"},
         "parts": {"image", "calibration", "sparse_depth", "points", "image_size"},
         "weights": {"depth.safetensors", "depth.json"},
     },
@@ -79,7 +79,7 @@ DECLARED = {
         "weights": {"masks.safetensors", "masks.json"},
     },
     "detect": {
-        "settings": {"detector", "device", "raw_lidar", "seed"},
+        "settings": {"detector", "device", "raw_lidar", "seed", "options"},
         "parts": {"points", "calibration", "image_size"},
         "reads": {"cloud", "counts", "cloud_columns"},
         "weights": {"detector.safetensors", "detector.json"},
@@ -161,6 +161,7 @@ CHANGES: tuple[tuple[str | None, str, Any, set[str]], ...] = (
     ("completion", "model", "{root}/weights/depth.safetensors", {"complete"}),
     ("completion", "backend", "onnxruntime", {"complete"}),
     ("completion", "device", "cuda", {"complete"}),
+    ("completion", "options", {"scale": 2}, {"complete"}),
     ("augment", "preset", "L", {"augment", "detect"}),
     ("augment", "semantics", "truth", {"augment"}),
     ("augment", "convention", "kitti", {"augment"}),
@@ -168,6 +169,7 @@ CHANGES: tuple[tuple[str | None, str, Any, set[str]], ...] = (
     ("augment", "check_depth", False, {"augment"}),
     ("detection", "model", "small_lidar", {"detect"}),
     ("detection", "device", "cuda", {"detect"}),
+    ("detection", "options", {"scale": 2}, {"detect"}),
 )
 SHAPES_NOTHING = {"data", "synth", "evaluation", "report", "train", "run", "made_with"}
 

@@ -29,7 +29,7 @@ def test_depth_cars_and_masks(streets: Path, tmp_path: Path, capsys: pytest.Capt
     assert (tmp_path / "real.md").read_text() == printed.rstrip("\n") + "\n"
     assert [line for line in printed.splitlines() if line and line[0] != "|"] == [
         "Completion on held-out rings, 2 frames (mm; %; s per frame)",
-        "Objects found, 2 frames (found/labelled; precision)",
+        "Objects found, 2 frames, augmented clouds from classical (found/labelled; precision)",
         "LiDAR points under masks, 2 frames (against the points in labelled 3D boxes)",
     ]
     found = json.loads((tmp_path / "real.json").read_text())
