@@ -13,11 +13,14 @@ INDENT = 4
 def meanings(kind: type) -> dict[str, str]:
     """Field -> its meaning, from lines "name  meaning" or "name, other  meaning"; several pairs may share a line.
 
-    A line that is indented further continues the meaning above it. Other text is passed over.
+    A line that is indented further continues the meaning above it. Other text is passed over. What a dataclass takes
+    over from another has its meaning there.
     """
     names = "|".join(sorted((re.escape(field.name) for field in dataclasses.fields(kind)), key=len, reverse=True))
     entry = re.compile(rf"(?:^|\s{{2,}})((?:{names})(?:, (?:{names}))*)\s{{2,}}")
     found: dict[str, str] = {}
+    for base in kind.__bases__:
+        found |= meanings(base) if dataclasses.is_dataclass(base) else {}
     current: tuple[str, ...] = ()
     for line in (kind.__doc__ or "").splitlines()[1:]:
         text = line.strip()

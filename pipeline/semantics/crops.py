@@ -24,7 +24,10 @@ class CropSettings:
     crop      (height, width) in pixels
     zoom      crops are enlarged by up to this factor or reduced by its inverse
     objects   share of crops that are laid round a pixel of an object (11 and up)
-    jitter, gamma, noise   of colours, as `completion.samples.Augmentation`; grey  share of crops without colour
+    jitter    of colours, as `completion.samples.Augmentation`
+    gamma     of colours, as there
+    noise     of colours, as there
+    grey      share of crops without colour
     balance   largest relative change of a colour channel against the others (white balance)
     blur      largest standard deviation of a Gaussian blur, pixels; half of the crops stay sharp
     texture   largest standard deviation of grain of all sizes, relative, drawn for each class in a crop: synthetic

@@ -97,3 +97,17 @@ def test_meanings_are_read_from_the_docstring() -> None:
         "other": "how many",
         "kind": "which",
     }
+
+
+@dataclass(frozen=True)
+class Longer(Listed):
+    """More of them.
+
+    more      a further one
+    """
+
+    more: int = 1
+
+
+def test_meanings_come_along_with_the_fields_of_another_dataclass() -> None:
+    assert meanings(Longer) == meanings(Listed) | {"more": "a further one"}
