@@ -237,7 +237,8 @@ def test_batches_depend_on_seed_and_step_alone() -> None:
     again = StepBatches(Streets(7, 64, 96), crops, seed=1, batch=2, accumulate=2, crops_per_frame=2)
     again[3]
     for a, b in zip(one[5], again[5]):
-        assert all(torch.equal(x, y) for x, y in zip(a, b))
+        for x, y in zip(a, b):  # frames without a camera have matrices of NaN
+            torch.testing.assert_close(x, y, rtol=0, atol=0, equal_nan=True)
     other = StepBatches(Streets(7, 64, 96), crops, seed=2, batch=2, accumulate=2, crops_per_frame=2)
     assert not torch.equal(one[5][0].rgb, other[5][0].rgb)
     assert not torch.equal(one[5][0].rgb, one[6][0].rgb)

@@ -33,7 +33,7 @@ from detection.ops import voxel_query as query_module
 from detection.ops.sparse_conv import Sites
 from detection.ops.voxel_query import voxel_query
 from detection.ops.voxelize import VoxelGrid
-from detection.train import training_scene
+from detection.training_batches import training_scene
 from detection.types import PointFrame
 from tests.detection.scenes import P2, box_frame
 

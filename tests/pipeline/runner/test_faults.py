@@ -17,7 +17,18 @@ from tests.pipeline.runner.damage import write_depth_folder
 from tests.pipeline.test_cli import ROOT, contents, done_frames, start
 from tests.pipeline.tiny_kitti import HEIGHT, WIDTH, write_tiny_kitti
 
-OPTIONS = ("--config", "kitti", "--stage", "augment", "--set", "augment.preset=D", "--workers", "1")
+OPTIONS = (
+    "--config",
+    "kitti",
+    "--stage",
+    "augment",
+    "--set",
+    "augment.preset=D",
+    "--set",
+    "augment.check_depth=false",
+    "--workers",
+    "1",
+)
 
 
 def cheap_run(folder: Path, frames: int) -> list[str]:

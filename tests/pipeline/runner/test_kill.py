@@ -35,7 +35,18 @@ def test_a_run_killed_at_twenty_moments_ends_with_the_same_bytes_each_time(quick
     data = write_tiny_kitti(tmp_path / "kitti", FRAMES)
     depth = np.random.default_rng(1).integers(1200, 9000, (48, 96)).astype(np.uint16)
     write_depth_folder(tmp_path / "depth", depth, [f"{index:06d}" for index in range(FRAMES)])
-    command = ["--config", "kitti", "--stage", "augment", "--workers", "1", "--set", "augment.preset=D"]
+    command = [
+        "--config",
+        "kitti",
+        "--stage",
+        "augment",
+        "--workers",
+        "1",
+        "--set",
+        "augment.preset=D",
+        "--set",
+        "augment.check_depth=false",
+    ]
     command += ["--data", str(data), "--depth-from", str(tmp_path / "depth")]
     program = [sys.executable, "-m", "tests.pipeline.runner.killed_runs", str(tmp_path), str(KILLS), str(SEED)]
     done = subprocess.run([*program, *command], cwd=ROOT, capture_output=True, text=True, check=False, timeout=300)
