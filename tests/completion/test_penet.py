@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,6 +29,15 @@ from completion.training_loss import LossSettings, training_loss
 from completion.windows import batch_view, window_corner, window_intrinsics
 from tests.completion.scenes import street
 from tests.reference.completion_propagation import scattered, shifted_by_kernels, smallest_valid
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Networks of a few channels: more threads only wait for each other on a busy machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def count(model: torch.nn.Module) -> int:
