@@ -29,12 +29,22 @@ class TrainingSample:
     draw_sparse: Callable[[np.random.Generator], FloatMap] | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class DrawnSample:
+    """A frame whose sparse map and target are drawn together, as where what is not given becomes the target."""
+
+    draw: Callable[[np.random.Generator], DepthFrame]
+
+
+Sample = DepthFrame | TrainingSample | DrawnSample
+
+
 class SampleSource(Protocol):
     """What training reads: a length, and a frame or a sample for every index."""
 
     def __len__(self) -> int: ...
 
-    def __getitem__(self, index: int, /) -> DepthFrame | TrainingSample: ...
+    def __getitem__(self, index: int, /) -> Sample: ...
 
 
 @dataclass(frozen=True)
@@ -153,15 +163,17 @@ def _warped(views: Views, augmentation: Augmentation, rng: np.random.Generator) 
 
 
 def draw_crop(
-    sample: DepthFrame | TrainingSample, augmentation: Augmentation, rng: np.random.Generator
+    sample: Sample, augmentation: Augmentation, rng: np.random.Generator
 ) -> tuple[FloatMap, NDArray[np.uint8], FloatMap]:
     """Sparse (h, w), RGB (h, w, 3) and target (h, w) of one augmented crop. SettingsError without a target."""
     crop = placed_crop(sample, augmentation, rng)
     return crop.sparse, crop.image, crop.target
 
 
-def placed_crop(sample: DepthFrame | TrainingSample, augmentation: Augmentation, rng: np.random.Generator) -> Crop:
+def placed_crop(sample: Sample, augmentation: Augmentation, rng: np.random.Generator) -> Crop:
     """An augmented crop and its place. SettingsError without a target."""
+    if isinstance(sample, DrawnSample):
+        sample = sample.draw(rng)
     if isinstance(sample, DepthFrame):
         sample = TrainingSample(sample)
     frame = sample.frame

@@ -57,7 +57,7 @@ def train(
     `out` receives state.safetensors (for resuming), last and best .safetensors with cards, log.csv, validation.csv and,
     when TensorBoard is installed, its events.
 
-    samples     `samples[i]` is a DepthFrame with target, or a TrainingSample
+    samples     `samples[i]` is a DepthFrame with target, or a TrainingSample or DrawnSample
     validation  frames with target; the diagnostics of each validation are logged
     facts       goes into the cards: data, command, ...
     seconds     stop after about this much time, with the state saved; call again to go on

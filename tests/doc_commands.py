@@ -28,7 +28,7 @@ STORY = (
 NOT_RUN = {
     r"^run_pipeline$|synth\.frames=4 |^make ": "takes minutes; CI runs the demo and the tests on their own",
     r"^pip install|^ray |RAY_ADDRESS|^srun|^torchrun": "installs, or needs several machines: tests/pipeline/runner",
-    r"--stage train|--stage synth|runs/trained": "trains for minutes to hours: tests/pipeline/test_training*.py",
+    r"--stage train|--stage synth|runs/(trained|adapted)": "trains for minutes to hours: tests/pipeline/training",
     r"--stage experiment": "a study of hours; plans and smoke runs: tests/pipeline/experiments",
     r"--stage bench|-m benchmarks|-m timeit": "measures for minutes: tests/pipeline/benchmark, tests/benchmarks",
     r"\.(tar|pth|pt) |result\.pkl|/(twise|pointrcnn|penet)": "needs a published file: test_importers.py",

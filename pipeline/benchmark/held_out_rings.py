@@ -15,10 +15,11 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from pipeline.benchmark.visibility import visible_points
 from pipeline.geometry.calibration import Calibration
+from pipeline.geometry.held_out import ring_maps
 from pipeline.geometry.project import project_points
 from pipeline.geometry.rings import split_rings
+from pipeline.geometry.visibility import visible_points
 
 Array = NDArray[np.float64]
 
@@ -58,11 +59,10 @@ def hold_out(
     ring = split_rings(points)
     given = ring % step == 0
     seen = visible_points(points, ring, calibration, image_size)
-    sparse = project_points(points[given], calibration, image_size)
+    sparse, truth = ring_maps(points, given, seen, calibration, image_size)
     visible = project_points(points[seen], calibration, image_size)
-    truth = project_points(points[seen & ~given], calibration, image_size)
     hull = convex_hull_mask(sparse > 0)
-    truth[(sparse > 0) | ~hull] = 0
+    truth[~hull] = 0
     everything = project_points(points, calibration, image_size)
     edges = _edge_windows(truth, visible, cv2.erode(hull.astype(np.uint8), np.ones((7, 7), np.uint8), borderValue=0))
     clean = _clean_windows(edges, everything, CLEAN_COLUMNS, CLEAN_ROWS[step])

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from detection.kitti_format import KittiObject, boxes_of
 from detection.ops.pooling import points_in_boxes
 from pipeline.base.errors import UsageError
-from pipeline.benchmark.visibility import visible_points
 from pipeline.data import Dataset, Frame
 from pipeline.geometry.in_view import lidar_pixels
 from pipeline.geometry.rings import split_rings
+from pipeline.geometry.visibility import visible_points
 from pipeline.semantics.conventions import GROUPS
 from pipeline.semantics.sources import SemanticsSource
 

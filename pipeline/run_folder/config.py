@@ -116,6 +116,11 @@ class TrainConfig(LibrarySection):
     network: Literal["completion", "detection", "segmentation"] = Field(
         default="completion", description="what is trained: completion, detection or segmentation"
     )
+    truth: Literal["depth", "held_out_rings"] = Field(
+        default="depth",
+        description="what completion learns from: the data set's true depth, or the rings of the scan that "
+        "beam_strides keeps back (points, calibration and pictures are enough)",
+    )
     beam_strides: tuple[int, ...] = Field(
         default=(),
         description="every n-th LiDAR ring, e.g. [1, 2, 4, 8]: completion draws n for every crop, detection sees every "

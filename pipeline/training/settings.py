@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from auglidar_base.errors import SettingsError
+from auglidar_base.errors import CheckpointError, SettingsError
 from pipeline.base.errors import UsageError
 from pipeline.base.settings import with_changes
 from pipeline.run_folder.config import Config
@@ -18,19 +18,23 @@ if TYPE_CHECKING:
 
 
 def completion_settings(config: Config) -> CompletionSettings:
-    """Of `completion.train`; the run's seed unless the section has its own."""
+    """Of `completion.train`; the run's seed unless the section has its own, the network of `warm_start` unless it names
+    a model."""
+    from completion.checkpoints import load_checkpoint
     from completion.models import default_spec
     from completion.train import TrainSettings
     from completion.training_loss import LossSettings, default_kind
 
     changes = config.train.library
     # Another architecture brings its own input scaling, which single keys may still change.
-    model = changes.get("model")
+    model, start = changes.get("model"), changes.get("warm_start")
     architecture = str(model.get("architecture", "twise")) if isinstance(model, Mapping) else "twise"
     try:
-        spec = default_spec(architecture)
+        spec = default_spec(architecture) if model or not start else load_checkpoint(str(start))[1].model
     except SettingsError as error:
         raise UsageError(f"train.model: {error}") from None
+    except CheckpointError as error:
+        raise UsageError(f"train: {error}") from None
     base = TrainSettings(spec, LossSettings(default_kind(spec)), seed=config.seed)
     return with_changes(base, changes, "train")
 

@@ -23,6 +23,7 @@ from pipeline.run_folder.frames import open_frames
 from pipeline.run_folder.preset import uses_raw_lidar
 from pipeline.stages.clouds import cloud_of
 from pipeline.training.beam_subsampling import RandomBeamSubsampling
+from pipeline.training.ring_samples import RingSamples, held_out_validation
 from pipeline.training.settings import completion_settings, detection_settings, segmentation_settings
 
 if TYPE_CHECKING:
@@ -130,11 +131,16 @@ def train_completion(config: Config, dataset: Dataset, out: Path) -> Path:
     """`completion.train` on frames with true depth; the run's seed unless the section has its own."""
     from completion.train import train
 
-    if not dataset[0].has("target_depth"):
-        raise UsageError(f"{dataset.root}: frame {dataset.ids[0]} has no true depth to train completion on")
     settings = completion_settings(config)
+    first, own = dataset[0], config.train.truth == "held_out_rings"
+    if not own and not first.has("target_depth"):
+        raise UsageError(
+            f"{dataset.root}: frame {first.id} has no true depth to train completion on; "
+            "train.truth=held_out_rings learns from the scans themselves"
+        )
     dataset, held_back = split(dataset, settings)
-    samples = DepthSamples(dataset, config.train.beam_strides, config.train.calibration_jitter)
+    strides, jitter = config.train.beam_strides, config.train.calibration_jitter
+    samples = (RingSamples if own else DepthSamples)(dataset, strides, jitter)
     validation = [_validation_frame(held_back[frame_id], config) for frame_id in held_back.ids]
     facts = training_facts(config)
     return train(settings, samples, out, validation=validation, facts=facts, progress=print_progress)
@@ -164,6 +170,8 @@ def _validation_frame(frame: Frame, config: Config) -> DepthFrame:
     """A held-back frame; with `beam_strides`, at 16 rows of 64 and without jitter, so that figures of runs compare."""
     from completion.types import DepthFrame
 
+    if config.train.truth == "held_out_rings":
+        return held_out_validation(frame, config.train.beam_strides)
     sparse = (
         RandomBeamSubsampling.of(frame, (4,), 0.0)(np.random.default_rng(0))
         if config.train.beam_strides

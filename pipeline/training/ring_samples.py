@@ -1,0 +1,52 @@
+"""The frames of a data set as samples whose truth is the rings that were kept back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from pipeline.base.errors import UsageError
+from pipeline.data import Dataset, Frame
+
+if TYPE_CHECKING:
+    from completion.samples import DrawnSample
+    from completion.types import DepthFrame
+
+NEEDED = ("points", "calibration", "image")
+
+
+@dataclass(frozen=True)
+class RingSamples:
+    """What `completion.train` reads for `train.truth: held_out_rings`; picklable for its worker processes.
+
+    Raises UsageError for a data set without points, calibration or pictures, and for strides that keep no ring back.
+    """
+
+    dataset: Dataset
+    beam_strides: tuple[int, ...]
+    calibration_jitter: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.beam_strides or min(self.beam_strides) < 2:
+            given = list(self.beam_strides)
+            raise UsageError(f"train.beam_strides: held_out_rings expects numbers from 2, as [2, 4, 8], got {given}")
+        first = self.dataset[0]
+        for part in NEEDED:
+            if not first.has(part):
+                raise UsageError(f"{self.dataset.root}: frame {first.id} has no {part} to hold rings out of")
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    def __getitem__(self, index: int, /) -> DrawnSample:
+        from completion.samples import DrawnSample
+        from pipeline.training.held_out_rings import HeldOutRings
+
+        return DrawnSample(HeldOutRings.of(self.dataset[index], self.beam_strides, self.calibration_jitter))
+
+
+def held_out_validation(frame: Frame, beam_strides: tuple[int, ...]) -> DepthFrame:
+    """A held-back frame at 16 rows of 64 (every 4th; the widest stride where that is none of them), no jitter."""
+    from pipeline.training.held_out_rings import HeldOutRings
+
+    return HeldOutRings.of(frame, beam_strides).every(4 if 4 in beam_strides else max(beam_strides))
