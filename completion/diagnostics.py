@@ -1,4 +1,4 @@
-"""Is a network alive? Its error with and without colour, and whether sigma separates the surfaces at depth edges."""
+"""Is a network alive? Its error with the true picture, a flat and another one, and whether sigma separates surfaces."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from auglidar_base.errors import SettingsError
 from completion.analysis import mixed_share
 from completion.infer import Completer
+from completion.pictures import other_picture, pictures_of
 from completion.types import CompletedDepth, DepthFrame, FloatMap
 
 
@@ -76,22 +77,26 @@ def _scores(completed: CompletedDepth, target: FloatMap) -> dict[str, float]:
 
 
 def diagnose(completer: Completer, frames: Iterable[DepthFrame]) -> dict[str, float]:
-    """Mean over frames with a target: MAE, tMAE (t = 1 m), edge tMAE in mm, mixed pixels in %; the MAE and tMAE with a
-    grey image (`grey_...`, equal when colour is ignored); sigma's statistics. All within `measured_region`. Frames
-    without an edge drop out of the means that need one. ValueError when no frame has a target.
+    """Mean over frames with a target: MAE, tMAE (t = 1 m), edge tMAE in mm, mixed pixels in %; the same with a grey
+    picture (`grey_...`) and with another frame's (`other_...`, see `completion.pictures`), equal when the picture is
+    ignored; sigma's statistics. All within `measured_region`. Frames without an edge drop out of the means that need
+    one. ValueError when no frame has a target.
     """
+    all_frames = list(frames)
+    images = [frame.image for frame in all_frames]
     rows: list[dict[str, float]] = []
-    for frame in frames:
-        if frame.target is None:
-            continue
-        target = measured_region(frame)
+    for number, frame in enumerate(all_frames):
+        target = measured_region(frame) if frame.target is not None else np.zeros(frame.size, np.float32)
         if not target.any():
             continue
-        completed = completer.complete(frame.sparse, frame.image, frame.K)
-        grey = completer.complete(frame.sparse, np.full_like(frame.image, 128), frame.K)
-        found = _scores(completed, target) | sigma_statistics(completed, target)
-        without = _scores(grey, target)
-        rows.append(found | {f"grey_{name}": without[name] for name in ("mae_mm", "tmae_mm")})
+        row: dict[str, float] = {}
+        for name, picture in pictures_of(frame.image, other_picture(number, images)).items():
+            completed = completer.complete(frame.sparse, picture, frame.K)
+            prefix = "" if name == "true" else f"{name}_"
+            row |= {f"{prefix}{key}": value for key, value in _scores(completed, target).items()}
+            if name == "true":
+                row |= sigma_statistics(completed, target)
+        rows.append(row)
     if not rows:
         raise SettingsError("no frame with a target to diagnose on")
     columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}

@@ -87,15 +87,11 @@ def score(prediction: NDArray[np.floating], frame: HeldOutFrame) -> dict[str, fl
     NaN when the frame has fewer than five clean windows.
     """
     prediction = np.asarray(prediction, dtype=np.float64)
-    predicted = prediction > 0
-    filled = prediction
-    if not predicted.all() and predicted.any():
-        index = distance_transform_edt(~predicted, return_distances=False, return_indices=True)
-        filled = prediction[tuple(index)]
+    predicted, everywhere = prediction > 0, filled(prediction)
     at = frame.truth > 0
-    error = np.abs(filled[at] - frame.truth[at])
+    error = np.abs(everywhere[at] - frame.truth[at])
     row, column = frame.edges[:, 0].astype(int), frame.edges[:, 1].astype(int)
-    edge_error = np.abs(filled[row, column] - frame.truth[row, column])
+    edge_error = np.abs(everywhere[row, column] - frame.truth[row, column])
     mixed, total = _mixed_counts(prediction, frame.visible.astype(np.float64), frame.edges)
     enough = int(frame.clean.sum()) >= MIN_CLEAN_WINDOWS
     return {
@@ -111,6 +107,16 @@ def score(prediction: NDArray[np.floating], frame: HeldOutFrame) -> dict[str, fl
         "edge_windows": float(len(frame.edges)),
         "clean_windows": float(frame.clean.sum()),
     }
+
+
+def filled(prediction: NDArray[np.floating]) -> Array:
+    """A depth map (H, W) whose holes (0) take the nearest predicted pixel."""
+    found: Array = np.asarray(prediction, dtype=np.float64)
+    predicted = found > 0
+    if not predicted.all() and predicted.any():
+        index = distance_transform_edt(~predicted, return_distances=False, return_indices=True)
+        found = found[tuple(index)]
+    return found
 
 
 def _percent(part: float, whole: float) -> float:

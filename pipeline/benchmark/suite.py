@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from completion.infer import Completer
 from completion.models.classical import ClassicalCompleter
+from completion.pictures import PICTURES
 from detection.kitti_format import KittiObject
 from detection.results import result_objects
 from detection.types import PointFrame
 from pipeline.base.errors import UsageError
-from pipeline.benchmark.held_out_rings import BEAM_STRIDES, hold_out, score
+from pipeline.benchmark.camera import COMPARED, distance_means, distance_sums, frame_pictures
+from pipeline.benchmark.held_out_rings import BEAM_STRIDES, HeldOutFrame, hold_out, score
 from pipeline.benchmark.object_recall import RecallReport, object_recall
 from pipeline.data import Dataset, Frame
 from pipeline.pointcloud.presets import PRESETS
@@ -26,6 +28,7 @@ from pipeline.run_folder.thresholds import ScoreThresholds
 from pipeline.training.thinned_clouds import thinned_cloud
 
 Progress = Callable[[str], None]
+Method = Callable[[NDArray[np.float32], NDArray[np.uint8]], NDArray[np.float32]]
 # Overlaps asked of each class: KITTI's own, and its loose one (people are small: 0.25 is a quarter of a step aside).
 IOUS = {"Car": (0.5, 0.7), "Pedestrian": (0.25, 0.5), "Cyclist": (0.25, 0.5)}
 WITHOUT_WEIGHTS = ("nearest", "classical")
@@ -52,25 +55,52 @@ def completion_scores(
     """Mean scores over frames, one entry per method and number of rows; see `held_out_rings.score` for the keys.
 
     names  "nearest", "classical" (linear in inverse depth), or weights or module:Class as `open_completer` takes them
+    Methods that may look at the picture are tried with a flat one and another frame's too: "pictures" holds their
+    scores by name, "distance" those of `camera.distance_means`.
     """
     methods = [(name, _method(name)) for name in names]
     if not methods:
         return []
-    found: dict[tuple[str, int], list[dict[str, float]]] = {}
-    for frame_id in dataset.ids:
-        frame = dataset[frame_id]
+    found: dict[tuple[str, int], dict[str, Tried]] = {}
+    for index, frame_id in enumerate(dataset.ids):
+        frame, pictures = dataset[frame_id], frame_pictures(dataset, index)
         for number in rows:
             held_out = hold_out(frame.points, frame.calibration, frame.image_size, number)
             for name, complete in methods:
-                start = time.perf_counter()
-                depth = complete(held_out.sparse, frame.image)
-                seconds = time.perf_counter() - start
-                found.setdefault((name, number), []).append(score(depth, held_out) | {"seconds": seconds})
+                tried = found.setdefault((name, number), {})
+                for picture in ("true",) if name in WITHOUT_WEIGHTS else PICTURES:
+                    tried.setdefault(picture, Tried()).add(complete, held_out, pictures[picture])
         progress(f"completion {frame_id}")
-    return [{"method": name, "rows": number} | _means(entries) for (name, number), entries in found.items()]
+    return [{"method": name, "rows": number} | _entry(tried) for (name, number), tried in found.items()]
 
 
-def _method(name: str) -> Callable[[NDArray[np.float32], NDArray[np.uint8]], NDArray[np.float32]]:
+@dataclass
+class Tried:
+    """A method with one kind of picture: its scores and sums over distance, frame by frame."""
+
+    scores: list[dict[str, float]] = field(default_factory=list)
+    sums: list[dict[str, NDArray[np.float64]]] = field(default_factory=list)
+
+    def add(self, complete: Method, held_out: HeldOutFrame, picture: NDArray[np.uint8]) -> None:
+        """One more frame."""
+        start = time.perf_counter()
+        depth = complete(held_out.sparse, picture)
+        seconds = time.perf_counter() - start
+        self.scores.append(score(depth, held_out) | {"seconds": seconds})
+        self.sums.append(distance_sums(depth, held_out))
+
+
+def _entry(tried: dict[str, Tried]) -> dict[str, Any]:
+    """What is reported of a method: its scores with the true picture, and beside them those with the others."""
+    means = {picture: _means(found.scores) for picture, found in tried.items()}
+    if len(tried) == 1:
+        return means["true"]
+    compared = {picture: {name: mean[name] for name in COMPARED} for picture, mean in means.items()}
+    distance = {picture: distance_means(found.sums) for picture, found in tried.items()}
+    return means["true"] | {"pictures": compared, "distance": distance}
+
+
+def _method(name: str) -> Method:
     completer: Completer = ClassicalCompleter("nearest") if name == "nearest" else open_completer(name, backend="auto")
     return lambda sparse, image: completer.complete(sparse, image).depth
 

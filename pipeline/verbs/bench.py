@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="lowest score that counts (default: each class' own, from the card)",
     )
-    add("--out", metavar="DIR", help="also write real.json and real.md there")
+    add("--out", metavar="DIR", help="also write real.json, real.md and camera.png there")
     add("--json", action="store_true", help="print JSON instead of tables")
 
 
@@ -100,6 +100,7 @@ def run(args: argparse.Namespace) -> int:
         folder.mkdir(parents=True, exist_ok=True)
         write_text(folder / "real.json", json.dumps(found, indent=1))
         write_text(folder / "real.md", tables)
+        _plot(folder, found["completion"])
     return 0
 
 
@@ -156,8 +157,26 @@ def _detection_rows(chosen: str | None, threshold: float | None) -> list[Any]:
 
 def _tables(found: dict[str, Any]) -> str:
     """All results as Markdown."""
-    tables = {"completion": _completion_table, "detection": _detection_table, "masks": _mask_table}
+    tables = {"completion": _completion_tables, "detection": _detection_table, "masks": _mask_table}
     return "\n\n".join("\n".join(table(found)) for name, table in tables.items() if found.get(name)) + "\n"
+
+
+def _plot(folder: Path, entries: list[dict[str, Any]]) -> None:
+    """camera.png: what the camera adds over distance, at 16 rows where they were measured."""
+    from pipeline.benchmark.camera import plot_camera
+
+    looked = [entry for entry in entries if "pictures" in entry]
+    rows = {entry["rows"] for entry in looked}
+    if looked:
+        shown = 16 if 16 in rows else max(rows)
+        plot_camera(folder / "camera.png", [entry for entry in looked if entry["rows"] == shown])
+
+
+def _completion_tables(found: dict[str, Any]) -> list[str]:
+    from pipeline.benchmark.camera import camera_table
+
+    looked = [entry for entry in found["completion"] if "pictures" in entry]
+    return _completion_table(found) + (["", *camera_table(looked, found["frames"])] if looked else [])
 
 
 def _completion_table(found: dict[str, Any]) -> list[str]:

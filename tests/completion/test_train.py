@@ -368,13 +368,16 @@ def test_diagnostics_tell_a_live_sigma_from_a_dead_one() -> None:
 def test_diagnostics_compare_with_a_grey_image() -> None:
     frame = street(3, 64, 96)
     found = diagnose(ClassicalCompleter(), [frame])
-    assert found["grey_mae_mm"] == found["mae_mm"] > 0  # this one does not look at colour
+    assert found["grey_mae_mm"] == found["other_mae_mm"] == found["mae_mm"] > 0  # this one does not look at colour
 
     class Looks:
         def complete(self, sparse, image, K=None):  # type: ignore[no-untyped-def]
-            return CompletedDepth(np.full_like(sparse, 1.0 + image.std()))
+            return CompletedDepth(np.full_like(sparse, 1.0 + image.std() + image[:, : image.shape[1] // 3].mean()))
 
-    assert diagnose(Looks(), [frame])["grey_mae_mm"] != diagnose(Looks(), [frame])["mae_mm"]
+    looked = diagnose(Looks(), [frame])
+    scores = ("mae_mm", "tmae_mm", "edge_tmae_mm", "mixed_percent")
+    assert {f"{picture}{score}" for picture in ("", "grey_", "other_") for score in scores} <= set(looked)
+    assert len({looked["mae_mm"], looked["grey_mae_mm"], looked["other_mae_mm"]}) == 3
     with pytest.raises(ValueError, match="no frame with a target"):
         diagnose(Looks(), [DepthFrame(frame.image, frame.sparse)])
 
