@@ -5,12 +5,16 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from auglidar_base.atomic import write_text
 from auglidar_base.errors import CheckpointError, SettingsError
 from pipeline.base.errors import UsageError
+
+if TYPE_CHECKING:
+    from pipeline.data import Dataset
 
 COLUMNS = ("mae", "rmse", "tmae", "trmse", "mixed", "mixed_all", "edge_tmae", "missing", "seconds")
 
@@ -28,9 +32,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add(
         "--suite",
-        choices=("real",),
+        choices=("real", "edges"),
         default="real",
-        help="real: held-out LiDAR rings, objects and masks on KITTI frames",
+        help="real: held-out LiDAR rings, objects and masks on KITTI frames; edges: how low the error at depth edges "
+        "can get there (--data, --frames, --rows, --out and --json alone count)",
     )
     add("--data", required=True, metavar="DIR", help="KITTI object folder (training/velodyne, image_2, calib, label_2)")
     add("--frames", metavar="FILE|a:b|ids", help="split file, positions, or ids separated by commas")
@@ -57,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="lowest score that counts (default: each class' own, from the card)",
     )
-    add("--out", metavar="DIR", help="also write real.json, real.md and camera.png there")
+    add("--out", metavar="DIR", help="also write real.json, real.md and camera.png (edges.json, edges.md) there")
     add("--json", action="store_true", help="print JSON instead of tables")
 
 
@@ -75,6 +80,8 @@ def run(args: argparse.Namespace) -> int:
     def progress(text: str) -> None:
         print(f"  {text}", file=sys.stderr)
 
+    if args.suite == "edges":
+        return _edges(dataset, args, progress)
     # Everything is opened before anything is measured: a wrong name should not cost an hour.
     try:
         names, rows = _completers(args.completers), row_numbers(args.rows)
@@ -159,6 +166,21 @@ def _tables(found: dict[str, Any]) -> str:
     """All results as Markdown."""
     tables = {"completion": _completion_tables, "detection": _detection_table, "masks": _mask_table}
     return "\n\n".join("\n".join(table(found)) for name, table in tables.items() if found.get(name)) + "\n"
+
+
+def _edges(dataset: Dataset, args: argparse.Namespace, progress: Callable[[str], None]) -> int:
+    from pipeline.benchmark.edge_ceiling import ceiling_tables, edge_ceiling
+    from pipeline.benchmark.suite import row_numbers
+
+    found = edge_ceiling(dataset, row_numbers(args.rows), progress)
+    tables = ceiling_tables(found)
+    print(json.dumps(found, indent=1) if args.json else tables)
+    if args.out:
+        folder = Path(args.out)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_text(folder / "edges.json", json.dumps(found, indent=1))
+        write_text(folder / "edges.md", tables)
+    return 0
 
 
 def _plot(folder: Path, entries: list[dict[str, Any]]) -> None:
