@@ -113,6 +113,7 @@ def _run_stages(args: argparse.Namespace, arguments: Sequence[str]) -> int:
         shard=args.shard,
         engine=args.engine,
         dry_run=args.dry_run,
+        verify=args.verify,
         command=("run_pipeline", *arguments),
     )
     if args.json is None:

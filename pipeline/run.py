@@ -37,6 +37,7 @@ class Request:
     stage      one of STAGES, or None for everything but training
     overrides  `key.sub=value` texts, applied after the file and the other options
     shard      (i, n), counted from 0
+    verify     read every file again to tell whether it changed
     command    the command line, for messages and failures.json
     """
 
@@ -47,6 +48,7 @@ class Request:
     shard: tuple[int, int] | None = None
     engine: str = "local"
     dry_run: bool = False
+    verify: bool = False
     command: tuple[str, ...] = field(default=("run_pipeline",))
 
 
@@ -69,7 +71,7 @@ def carry_out(request: Request, record: dict[str, Any] | None = None) -> int:
         augment_settings(config)  # a preset without its masks is refused before anything is written or promised
     record |= {"run": str(run.root), "stage": stage}
     if request.dry_run:
-        record["estimates"] = dry_run(config, run, stage, request.shard)
+        record["estimates"] = dry_run(config, run, stage, request.shard, request.verify)
         return DONE
     prepare_folder(run, config)
     make_data(config, run, stage, request.shard)
@@ -149,7 +151,9 @@ def make_data(config: Config, run: RunFolder, stage: str, shard: tuple[int, int]
     make_synthetic_data(config, root)
 
 
-def dry_run(config: Config, run: RunFolder, stage: str, shard: tuple[int, int] | None) -> list[dict[str, Any]]:
+def dry_run(
+    config: Config, run: RunFolder, stage: str, shard: tuple[int, int] | None, verify: bool = False
+) -> list[dict[str, Any]]:
     """Prints what would be done, and gives it; writes nothing but the ledger of a run that exists."""
     from pipeline.runner.estimate import estimate_batch, unmeasured
 
@@ -158,7 +162,7 @@ def dry_run(config: Config, run: RunFolder, stage: str, shard: tuple[int, int] |
         frames = synth_settings(config).frames
         estimates = unmeasured(config, frame_stages_for(stage, config), frames, workers)
     elif run.root.is_dir():
-        batch = open_batch(config, run, shard, StopRequest())
+        batch = open_batch(config, run, shard, StopRequest(), verify=verify)
         estimates = estimate_batch(batch, stages_to_run(stage, config, batch.dataset), workers)
         batch.close()
     else:
@@ -173,7 +177,7 @@ def run_batch(
     request: Request, config: Config, run: RunFolder, stage: str, stop: StopRequest, record: dict[str, Any]
 ) -> int:
     """The frame stages, then the scores and the report when they are asked for."""
-    batch = open_batch(config, run, request.shard, stop, request.engine)
+    batch = open_batch(config, run, request.shard, stop, request.engine, request.verify)
     for note in batch.dataset.notes:
         print(f"note: {note}", file=sys.stderr)
     try:
@@ -181,7 +185,8 @@ def run_batch(
         summaries = [batch.run_stage(name) for name in stages if not stop()]
         if not stop() and stage in ("evaluate", "report"):
             score(config, batch, explicit=request.stage == "evaluate")
-        failures = update_failures(run, request.command)
+        needed = [*frame_stages_for("report", config, has_points(batch.dataset)), *stages, "evaluate"]
+        failures = update_failures(run, request.command, batch.dataset.ids, needed)
     finally:
         batch.close()
     if not stop() and stage == "report":

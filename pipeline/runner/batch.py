@@ -175,13 +175,22 @@ def shard_of(frames: Sequence[str], shard: tuple[int, int] | None) -> tuple[str,
 
 
 def open_batch(
-    config: Config, run: RunFolder, shard: tuple[int, int] | None, stop: StopRequest, engine: str = "local"
+    config: Config,
+    run: RunFolder,
+    shard: tuple[int, int] | None,
+    stop: StopRequest,
+    engine: str = "local",
+    verify: bool = False,
 ) -> Batch:
-    """A batch over the frames of the configuration; engine: local or ray. UsageError when it cannot be set up."""
+    """A batch over the frames of the configuration. UsageError when it cannot be set up.
+
+    engine  local or ray
+    verify  every input and output is read and hashed again, whatever the ledger remembers of it
+    """
     dataset = open_frames(config, run)
     frames = shard_of(dataset.ids, shard)
     own = run.ledger(shard)
-    ledger = Ledger(own, run.ledgers())
+    ledger = Ledger(own, run.ledgers(), trust=not verify)
     worker = partial(FrameWorker, config, run.root)
     budget = DiskBudget(run.root, config.run.keep_free_gb, config.run.max_gb)
     return Batch(

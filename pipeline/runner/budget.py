@@ -6,6 +6,8 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.base.disk import no_more_files
+
 GB = 1e9
 
 
@@ -29,4 +31,8 @@ class DiskBudget:
         free = shutil.disk_usage(self.folder).free / GB
         if free < self.keep_free_gb:
             return f"{self.folder}: {free:.2f} GB free, {self.keep_free_gb:g} GB are to be kept (run.keep_free_gb)"
-        return ""
+        return self._no_more_files()
+
+    def _no_more_files(self) -> str:
+        reason = no_more_files(self.folder)
+        return f"{self.folder}: {reason}" if reason else ""

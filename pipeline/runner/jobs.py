@@ -7,6 +7,7 @@ import traceback
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from pipeline.base.disk import why_full
 from pipeline.base.errors import DataError, UsageError
 from pipeline.run_folder.frame_outputs import Written
 
@@ -71,7 +72,8 @@ class Outcome:
 def outcome_of_error(task: Task, error: BaseException, seconds: float) -> Outcome:
     """The outcome of a task that raised `error`."""
     if isinstance(error, OSError) and error.errno in _FATAL_ERRNO and not isinstance(error, DataError):
-        reason = f"{_FATAL_ERRNO[error.errno]} ({error.filename or error.strerror})"
+        what = why_full(error.filename) if error.errno == errno.ENOSPC else _FATAL_ERRNO[error.errno]
+        reason = f"{what} ({error.filename or error.strerror})"
         return Outcome(task, {}, seconds, _failure(task, "data", found=reason), fatal=reason)
     if isinstance(error, DataError):
         failure = Failure(task.stage, task.frame, "data", error.where, error.expected, error.found, error.hint)

@@ -92,6 +92,11 @@ def main_parser(verbs: dict[str, str]) -> argparse.ArgumentParser:
         help="how it went, as JSON: into FILE, or on standard output (everything else then goes to standard error)",
     )
     add("--dry-run", action="store_true", help="print frames, files, GB and minutes; write nothing")
+    add(
+        "--verify",
+        action="store_true",
+        help="read every file again to see whether it changed, instead of trusting sizes, times and inodes",
+    )
     return parser
 
 
