@@ -126,6 +126,11 @@ class TrainConfig(LibrarySection):
         description="every n-th LiDAR ring, e.g. [1, 2, 4, 8]: completion draws n for every crop, detection sees every "
         "frame once with each n; none: the frame's sparse map, the run's clouds",
     )
+    rehearse: str | None = Field(
+        default=None,
+        description="completion: folder of frames with true depth in KITTI's layout (`--stage synth` makes one), from "
+        "which one sample in three comes, so that the network does not forget them",
+    )
     calibration_jitter: float = Field(
         default=0.0,
         description="with beam_strides: standard deviation, degrees, of a random rotation between LiDAR and camera",

@@ -16,18 +16,19 @@ from pipeline.base.paths import RunFolder
 from pipeline.base.progress import duration
 from pipeline.base.settings import plain
 from pipeline.base.versions import made_with
-from pipeline.data import Dataset, Frame
+from pipeline.data import Dataset, Frame, open_dataset
 from pipeline.run_folder.config import Config
 from pipeline.run_folder.frame_outputs import FrameOutputs
 from pipeline.run_folder.frames import open_frames
 from pipeline.run_folder.preset import uses_raw_lidar
 from pipeline.stages.clouds import cloud_of
 from pipeline.training.beam_subsampling import RandomBeamSubsampling
+from pipeline.training.rehearsal import Rehearsal
 from pipeline.training.ring_samples import RingSamples, held_out_validation
 from pipeline.training.settings import completion_settings, detection_settings, segmentation_settings
 
 if TYPE_CHECKING:
-    from completion.samples import TrainingSample
+    from completion.samples import SampleSource, TrainingSample
     from completion.types import DepthFrame
     from detection.kitti_format import KittiObject
     from detection.train import LabelledFrames
@@ -132,18 +133,32 @@ def train_completion(config: Config, dataset: Dataset, out: Path) -> Path:
     from completion.train import train
 
     settings = completion_settings(config)
-    first, own = dataset[0], config.train.truth == "held_out_rings"
-    if not own and not first.has("target_depth"):
-        raise UsageError(
-            f"{dataset.root}: frame {first.id} has no true depth to train completion on; "
-            "train.truth=held_out_rings learns from the scans themselves"
-        )
+    if config.train.truth == "depth":
+        require_depth(dataset, "; train.truth=held_out_rings learns from the scans themselves")
     dataset, held_back = split(dataset, settings)
-    strides, jitter = config.train.beam_strides, config.train.calibration_jitter
-    samples = (RingSamples if own else DepthSamples)(dataset, strides, jitter)
+    samples = completion_samples(dataset, config)
     validation = [_validation_frame(held_back[frame_id], config) for frame_id in held_back.ids]
     facts = training_facts(config)
     return train(settings, samples, out, validation=validation, facts=facts, progress=print_progress)
+
+
+def require_depth(dataset: Dataset, hint: str = "") -> None:
+    """Raises UsageError when the first frame has no true depth."""
+    if not dataset[0].has("target_depth"):
+        raise UsageError(f"{dataset.root}: frame {dataset.ids[0]} has no true depth to train completion on{hint}")
+
+
+def completion_samples(dataset: Dataset, config: Config) -> SampleSource:
+    """The frames with what `train.truth` says is their truth, and those of `train.rehearse` between them."""
+    section = config.train
+    kind = RingSamples if section.truth == "held_out_rings" else DepthSamples
+    samples = kind(dataset, section.beam_strides, section.calibration_jitter)
+    if section.rehearse is None:
+        return samples
+    other = open_dataset("kitti_object", section.rehearse)
+    require_depth(other, " (train.rehearse)")
+    every = (1, *section.beam_strides) if section.beam_strides else ()
+    return Rehearsal(samples, DepthSamples(other, every, section.calibration_jitter))
 
 
 class Validated(Protocol):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import collections
+import typing
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,17 +11,19 @@ import numpy as np
 import pytest
 
 from completion.checkpoints import load_checkpoint
-from completion.samples import Augmentation, DrawnSample, placed_crop
+from completion.samples import Augmentation, DrawnSample, TrainingSample, placed_crop
 from completion.types import DepthFrame
 from pipeline.base.errors import DataError, UsageError
 from pipeline.cli import main
-from pipeline.data import Frame
+from pipeline.data import Frame, open_dataset
 from pipeline.geometry.calibration import Calibration
 from pipeline.geometry.held_out import ring_maps
 from pipeline.geometry.project import project_points
 from pipeline.run_folder.config import load_config
 from pipeline.training.held_out_rings import HeldOutRings, rings_of
+from pipeline.training.rehearsal import Rehearsal
 from pipeline.training.settings import completion_settings
+from pipeline.training.stage import completion_samples
 from tests.pipeline.tiny_kitti import CALIBRATION, HEIGHT, WIDTH, tiny_frame, write_tiny_kitti
 
 SIZE = (HEIGHT, WIDTH)
@@ -138,18 +142,38 @@ def test_two_steps_in_one_go_and_resumed_give_the_same_weights(recordings: Path,
     assert len(list((tmp_path / "mine" / "depth").glob("*.png"))) == 2
 
 
+def test_one_sample_in_three_is_rehearsed() -> None:
+    for own, other in ((4, 3), (9, 2), (1, 1)):
+        mixed: typing.Any = Rehearsal([f"own {i}" for i in range(own)], [f"other {i}" for i in range(other)])
+        seen = collections.Counter(mixed[index] for index in range(len(mixed)))
+        assert len(seen) == own + other
+        count = sum(times for name, times in seen.items() if name.startswith("other"))
+        assert 3 * count == len(mixed)
+
+
+def test_rehearsed_frames_have_their_own_truth(recordings: Path, tmp_path: Path) -> None:
+    streets = write_tiny_kitti(tmp_path, 1)
+    config = load_config("self-supervised", [f"train.rehearse={streets}", "train.beam_strides=[2, 4]"])
+    samples = completion_samples(open_dataset("kitti_object", recordings), config)
+    rehearsed, *own = (samples[index] for index in range(len(samples)))
+    assert isinstance(rehearsed, TrainingSample)
+    np.testing.assert_array_equal(rehearsed.frame.target, open_dataset("kitti_object", streets)[0].target_depth)
+    assert all(isinstance(each, DrawnSample) for each in own)
+
+
 @pytest.mark.parametrize(
     ("change", "line"),
     [
         ("beam_strides=[8]", "000000: expected at least 32 LiDAR rings"),
         ("beam_strides=[1, 2]", "train.beam_strides: held_out_rings expects numbers from 2, as [2, 4, 8], got [1, 2]"),
+        ("rehearse=RECORDINGS", "no true depth to train completion on (train.rehearse)"),
         ("beam_strides=[]", "train.beam_strides: held_out_rings expects numbers from 2"),
     ],
 )
 def test_what_cannot_be_learned_from_is_one_line(
     recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], change: str, line: str
 ) -> None:
-    assert adapt(recordings, tmp_path, change) == 2
+    assert adapt(recordings, tmp_path, change.replace("RECORDINGS", str(recordings))) == 2
     error = capsys.readouterr().err
     assert line in error.splitlines()[-1]
     assert "Traceback" not in error
