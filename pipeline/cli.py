@@ -5,34 +5,77 @@ from __future__ import annotations
 import argparse
 import contextlib
 import difflib
+import errno
 import signal
 import sys
+import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from pipeline.base.disk import why_full
 from pipeline.base.errors import DataError, RenamedSettingWarning, UsageError
+from pipeline.base.streams import lost_output, patient_streams
 from pipeline.runner.signals import Terminated, sigterm_as_interrupt
 from pipeline.verbs import available_verbs, verb_module
 from pipeline.verbs.parsers import STAGE_HELP, main_parser, verb_parser
 
+# sysexits.h, EX_SOFTWARE: a fault of the program. 1 says that frames failed, and nothing else.
+FAULT = 70
+
+
+def program() -> int:
+    """The console script; returns the exit code, also for a fault of the program, whose traceback is printed."""
+    try:
+        return main()
+    except Exception:
+        with patient_streams():
+            traceback.print_exc()
+        return FAULT
+
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The console script; returns the exit code."""
+    """Carries out the arguments; returns the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
+    with patient_streams() as output:
+        code = _answered(arguments)
+        output.flush()
+        lost = lost_output(output)
+        if lost:
+            print(f"run_pipeline: {lost}", file=sys.stderr)
+    return code or (2 if lost else 0)
+
+
+def _answered(arguments: list[str]) -> int:
+    """The exit code; whatever the user can do something about is one line."""
     try:
+        _check_names(arguments)
         with sigterm_as_interrupt(), _renamed_settings_in_a_line():
             return _dispatch(arguments)
     except (UsageError, DataError) as error:
         print(f"run_pipeline: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        what = why_full(error.filename) if error.errno == errno.ENOSPC else error.strerror or str(error)
+        print(f"run_pipeline: {f'{error.filename}: ' if error.filename else ''}{what}", file=sys.stderr)
+        return 2
+    except MemoryError:
+        print("run_pipeline: there is not enough memory; try fewer --workers", file=sys.stderr)
+        return 2
     except KeyboardInterrupt as interrupt:
         print("run_pipeline: interrupted; the same command continues where it was", file=sys.stderr)
         return 128 + (signal.SIGTERM if isinstance(interrupt, Terminated) else signal.SIGINT)
-    except BrokenPipeError:
-        # The reader of our output went away (`run_pipeline ... | head`).
-        sys.stderr.close()
-        return 1
+
+
+def _check_names(arguments: Sequence[str]) -> None:
+    """Refuses letters that cannot be told from their bytes here: a configuration could not name them either."""
+    for argument in arguments:
+        if any("\ud800" <= letter <= "\udfff" for letter in argument):
+            encoding = sys.getfilesystemencoding()
+            raise UsageError(
+                f"{argument}: expected text in {encoding}; "
+                + ("rename it" if encoding == "utf-8" else "set PYTHONUTF8=1 or LC_ALL=C.UTF-8")
+            )
 
 
 @contextlib.contextmanager
@@ -130,4 +173,4 @@ def _run_stages(args: argparse.Namespace, arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(program())

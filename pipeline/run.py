@@ -224,5 +224,7 @@ def conclude(
         print(f"some frames failed: {run.failures} says which and why", file=sys.stderr)
     if stop():
         print(f"{stop.reason}; to continue: {shlex.join(request.command)}", file=sys.stderr)
-        return 128 + stop.signal_number if stop.signal_number else SOME_FAILED
+        if stop.signal_number:
+            return 128 + stop.signal_number
+        return SOME_FAILED if failed else REFUSED  # refused: the disk budget, and every frame so far went well
     return SOME_FAILED if failed else DONE

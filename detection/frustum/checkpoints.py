@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from auglidar_base.array_files import npz_arrays
 from auglidar_base.errors import CheckpointError, SettingsError
 from detection.checkpoints import load_exactly, load_tensors, read_card, write_card
 from detection.frustum.coding import CLASSES
@@ -79,9 +79,9 @@ def import_frustum_pointnet(path: str | Path, variant: str) -> FrustumPointNet:
 
 def _numpy_variables(path: Path) -> dict[str, Tensor]:
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as parts:
-            return {name: torch.from_numpy(np.asarray(parts[name], np.float32)) for name in parts.files}
-    except (OSError, ValueError, EOFError, KeyError, BadZipFile) as error:
+        parts = npz_arrays(path.read_bytes())
+        return {name: torch.from_numpy(part.astype(np.float32)) for name, part in parts.items()}
+    except (OSError, ValueError) as error:
         raise CheckpointError(f"{path}: expected an .npz of arrays by TensorFlow name ({error})") from None
 
 

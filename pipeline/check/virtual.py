@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from auglidar_base.array_files import ArrayFileError, npy_array
 from pipeline.base.errors import DataError
 from pipeline.check.depths import check_depth, read_map
 from pipeline.check.faults import Finding
@@ -173,8 +173,8 @@ def _read_virconv(path: Path, name: str) -> tuple[NDArray[np.float64] | None, li
     if not data:
         return None, [Finding("empty_file", name, str(path), "0 bytes")]
     try:
-        rows = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError) as error:
+        rows = npy_array(data)
+    except ArrayFileError as error:
         return None, [Finding("truncated_file", name, str(path), f"not a whole .npy array: {error}")]
     if rows.ndim != 2 or rows.shape[1] != 8 or rows.dtype not in (np.float16, np.float32):
         message = f"array {rows.shape} {rows.dtype}, expected (N, 8) float16 (or float32)"

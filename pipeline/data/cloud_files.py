@@ -7,13 +7,13 @@ format", 1994; the PCD 0.7 format page of the Point Cloud Library.
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from auglidar_base.array_files import ArrayFileError, npy_array
 from pipeline.base.errors import DataError
 from pipeline.data.bin_clouds import read_velodyne
 from pipeline.data.cloud_columns import CloudForm
@@ -43,6 +43,7 @@ _PLY_TYPES = {
 INTENSITY_NAMES = ("intensity", "scalar_intensity", "reflectivity", "reflectance", "remission", "remissions", "i")
 # A header longer than this is not a header.
 _MAX_HEADER = 65536
+_MOST_COLUMNS = 256
 _KITTI = CloudForm()
 
 
@@ -115,13 +116,17 @@ def read_cloud(path: str | Path) -> Cloud:
 
 def _read_npy(data: bytes, path: Path) -> Cloud:
     try:
-        array = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError) as error:
+        array = npy_array(data)
+    except ArrayFileError as error:
         raise DataError(path, "a .npy array of numbers", str(error)) from None
-    if array.ndim != 2 or array.shape[1] < 3:
+    if array.dtype.kind not in "biuf":
+        raise DataError(path, "a .npy array of numbers", f"an array of {array.dtype}")
+    if array.ndim != 2 or not 3 <= array.shape[1] <= _MOST_COLUMNS:
         raise DataError(path, "an (N, 3 or more) array", f"shape {array.shape}")
     names = ("x", "y", "z", "intensity", *(f"column{i}" for i in range(4, array.shape[1])))
-    return Cloud(array.astype(np.float32), names[: array.shape[1]])
+    # Numbers beyond float32 become infinite here; `read_points` refuses them.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return Cloud(array.astype(np.float32, copy=False), names[: array.shape[1]])
 
 
 def ply_bytes(cloud: Cloud) -> bytes:

@@ -101,9 +101,13 @@ class Dataset:
             return tuple(self.ids[i] for i in frames)
         if isinstance(frames, str):
             start, colon, stop = frames.partition(":")
-            if colon and all(part == "" or part.lstrip("-").isdigit() for part in (start, stop)):
+            if colon and all(part == "" or _is_position(part) for part in (start, stop)):
                 return self.ids[slice(int(start) if start else None, int(stop) if stop else None)]
         return None
+
+
+def _is_position(text: str) -> bool:
+    return len(text) < 19 and text.removeprefix("-").isdecimal()
 
 
 def _names(frames: str | Path | Iterable[str]) -> list[str]:

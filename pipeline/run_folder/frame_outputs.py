@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from auglidar_base.array_files import ArrayFileError, npz_arrays
 from auglidar_base.atomic import write_bytes
 from completion.types import CompletedDepth
 from detection.kitti_format import KittiObject, format_line
 from pipeline.base.errors import DataError
+from pipeline.base.files import read_file
 from pipeline.base.paths import RunFolder
 from pipeline.data.depth_png import decode_depth, depth_png_bytes, encode_depth, read_depth_png
 from pipeline.data.kitti_object import read_labels
@@ -114,10 +116,15 @@ class FrameOutputs:
         """{"columns": [...], "points": N, "steps": [{"step", "in", "out"}, ...]} of the augmentation."""
         path = self.to_read("counts")
         try:
-            record: dict[str, Any] = json.loads(read_run_file(path))
-        except ValueError:
-            raise DataError(path, "JSON written by the augment stage", "something else", _REDO) from None
-        return record
+            record: Any = json.loads(read_run_file(path))
+        except (ValueError, RecursionError) as error:
+            if isinstance(error, DataError):
+                raise
+            record = None
+        columns = record.get("columns") if isinstance(record, dict) else None
+        if not (isinstance(columns, list) and all(isinstance(name, str) for name in columns)):
+            raise DataError(path, "JSON written by the augment stage", "something else", _REDO)
+        return dict(record)
 
     def remove_other_presets_cloud(self) -> None:
         """Removes an augmented cloud that lies here from before the run went back to raw LiDAR (preset L).
@@ -142,10 +149,7 @@ _REDO = "remove it and run the stage again"
 
 def read_run_file(path: Path) -> bytes:
     """The bytes of a file that an earlier stage wrote."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise DataError(path, "a file of an earlier stage", str(error.strerror)) from None
+    return read_file(path, "a file of an earlier stage")
 
 
 def content_hash(data: bytes) -> str:
@@ -176,9 +180,6 @@ def npz_bytes(arrays: dict[str, NDArray[Any]]) -> bytes:
 def read_npz(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     """The named arrays of an .npz. Raises DataError when it is damaged or one is missing; pickles are refused."""
     try:
-        with np.load(io.BytesIO(read_run_file(path)), allow_pickle=False) as archive:
-            return {name: archive[name] for name in names}
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zipfile.LargeZipFile, OSError) as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(path, f"an .npz with {', '.join(names)}", f"{type(error).__name__}: {error}", _REDO) from None
+        return npz_arrays(read_run_file(path), names)
+    except ArrayFileError as error:
+        raise DataError(path, f"an .npz with {', '.join(names)}", str(error), _REDO) from None

@@ -120,7 +120,7 @@ class Ledger:
         if not stat.S_ISREG(status.st_mode) or status.st_size > _MAX_HASHED_BYTES:
             # A pipe would wait for ever, and no reader takes a file of this size: the key need not tell them apart.
             return f"not read: {status.st_mode} {status.st_size} {status.st_mtime_ns}"
-        place = os.path.abspath(path)
+        place = os.fsencode(os.path.abspath(path)).decode("utf-8", "backslashreplace")
         signs = (status.st_size, status.st_mtime_ns, status.st_ctime_ns, _signed(status.st_ino))
         known = self._remembered(place, signs) if self._trust else None
         if known is not None:

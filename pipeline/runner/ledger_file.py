@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -39,7 +40,7 @@ CREATE TABLE IF NOT EXISTS files (
 def opened(path: Path, make: bool) -> sqlite3.Connection:
     """A connection to a ledger with the tables of today; `make`: the file too. UsageError when it cannot be used."""
     # Not mode=ro: after a crash of its owner SQLite may have to roll back the last transaction before reading.
-    uri = f"file:{quote(str(path.resolve()))}" + ("" if make else "?mode=rw")
+    uri = f"file:{quote(os.fsencode(path.resolve()))}" + ("" if make else "?mode=rw")
     with explained(path):
         connection = sqlite3.connect(uri, uri=True, timeout=WAIT_SECONDS)
         try:

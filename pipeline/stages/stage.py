@@ -43,6 +43,7 @@ NOT_IN_KEYS = {
     "pipeline/base/paths.py": "says where files lie, not what is in them",
     "pipeline/base/errors.py": "a frame that fails has no result",
     "pipeline/base/files.py": "gives the bytes of a file or fails",
+    "auglidar_base/array_files.py": "gives the arrays of a file or fails",
     "auglidar_base/errors.py": "a frame that fails has no result",
     "auglidar_base/atomic.py": "a file is written whole or not at all",
 }

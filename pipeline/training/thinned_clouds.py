@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from auglidar_base.array_files import ArrayFileError, npy_array
 from auglidar_base.atomic import write_bytes
 from pipeline.base.errors import UsageError
 from pipeline.base.paths import RunFolder
@@ -86,8 +88,8 @@ class ThinnedClouds:
     def _points(self, frame: Frame, step: int) -> NDArray[np.float32]:
         path = self._path(frame.id, step)
         if path.is_file():
-            kept: NDArray[np.float32] = np.load(path, allow_pickle=False)
-            return kept
+            with suppress(ArrayFileError):  # damaged: it is made again
+                return npy_array(path.read_bytes()).copy()
         from detection.inputs import in_view_openpcdet
         from detection.types import PointFrame
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import json
 import sys
 from pathlib import Path
 
 from detection.evaluation.submission import TEST_FRAMES, check_submission, write_archive
+from pipeline.base.disk import why_full
+from pipeline.base.errors import UsageError
 
 _SHOWN = 20
 
@@ -49,7 +52,11 @@ def run(args: argparse.Namespace) -> int:
         if len(errors) > _SHOWN:
             print(f"error: ... and {len(errors) - _SHOWN} more", file=sys.stderr)
         return 2
-    archive = write_archive(folder, Path(args.archive), args.test_frames)
+    try:
+        archive = write_archive(folder, Path(args.archive), args.test_frames)
+    except OSError as error:
+        what = why_full(args.archive) if error.errno == errno.ENOSPC else error.strerror
+        raise UsageError(f"{args.archive}: cannot be written: {what}") from None
     if args.json:
         print(json.dumps({"archive": str(archive), "errors": [], "warnings": warnings}, indent=1))
         return 0

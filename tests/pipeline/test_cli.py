@@ -224,10 +224,10 @@ def test_frames_are_selected_by_positions_ids_and_split_files(data: Path, tmp_pa
 def test_a_disk_budget_stops_cleanly_and_the_run_continues(data: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "run"
     command = [*AUGMENT, "--data", str(data), "--out", str(out), "--workers", "1"]
-    assert main([*command, "--set", "run.max_gb=0.000001"]) == 1
+    assert main([*command, "--set", "run.max_gb=0.000001"]) == 2  # no frame failed
     assert "disk budget of 1e-06 GB used up" in capsys.readouterr().err
     assert len(done_frames(out, "complete")) == 1
-    assert main([*command, "--set", "run.keep_free_gb=1e9"]) == 1
+    assert main([*command, "--set", "run.keep_free_gb=1e9"]) == 2
     assert "are to be kept" in capsys.readouterr().err
     assert main(command) == 0
     assert len(done_frames(out, "augment")) == 4
