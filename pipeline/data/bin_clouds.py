@@ -28,13 +28,14 @@ def read_velodyne(path: str | Path, form: CloudForm = _KITTI) -> NDArray[np.floa
     """
     path = Path(path)
     points = _first_four(read_rows(path, form))
-    bad = ~np.isfinite(points).all(axis=1)
-    if bad.any():
+    # Minimum and maximum show NaN and infinity without a second array of the cloud's size.
+    if len(points) and not np.isfinite([points.min(), points.max()]).all():
+        bad = ~np.isfinite(points).all(axis=1)
         found = (
             f"{int(bad.sum())} of {len(points)} points with NaN or infinite values (first: point {int(bad.argmax())})"
         )
         raise DataError(path, f"{_WHAT} of finite numbers", found)
-    largest = float(np.abs(points[:, :3]).max())
+    largest = float(max(-points[:, :3].min(), points[:, :3].max()))
     if largest > MAX_COORDINATE:
         raise DataError(
             path, f"coordinates within {MAX_COORDINATE:g} m", f"{largest:g} m", "is it float32 x y z intensity?"

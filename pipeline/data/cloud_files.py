@@ -83,14 +83,17 @@ def read_measured(path: Path, form: CloudForm = _KITTI) -> tuple[NDArray[np.floa
     """(N, 4) x y z intensity of a .npy, .ply or .pcd file, and how many points without a return were left out."""
     cloud = read_cloud(path)
     small = [name.lower() for name in cloud.columns]
-    wanted = [cloud.values[:, small.index(name)] for name in ("x", "y", "z")]
-    intensity = next((small.index(name) for name in INTENSITY_NAMES if name in small), None)
-    wanted.append(np.zeros(len(cloud.values), np.float32) if intensity is None else cloud.values[:, intensity])
-    points = np.column_stack(wanted).astype(np.float32)
+    wanted = [small.index(name) for name in ("x", "y", "z")]
+    wanted += [small.index(name) for name in INTENSITY_NAMES if name in small][:1]
+    points = cloud.values
+    if wanted != list(range(4)) or points.shape[1] != 4:
+        points = np.zeros((len(cloud.values), 4), np.float32)
+        points[:, : len(wanted)] = cloud.values[:, wanted]
     if path.suffix.lower() == ".npy" or form.keep_empty:
         return points, 0
     empty = np.isnan(points[:, :3]).any(axis=1) | (points[:, :3] == 0).all(axis=1)
-    return np.ascontiguousarray(points[~empty]), int(empty.sum())
+    count = int(empty.sum())
+    return np.ascontiguousarray(points[~empty] if count else points), count
 
 
 def read_cloud(path: str | Path) -> Cloud:
@@ -179,31 +182,34 @@ def _read_ply(data: bytes, path: Path) -> Cloud:
     order = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}.get(kind)
     if order is None or not names:
         raise DataError(path, "a PLY file with vertices", f"format {kind or 'unknown'} with {len(names)} properties")
-    return _table(data[offset:], count, names, [order + t if order else t for t in types], kind == "ascii", path)
+    return _table(data, offset, count, names, [order + t if order else t for t in types], kind == "ascii", path)
 
 
 def _read_pcd(data: bytes, path: Path) -> Cloud:
     lines, offset = _header(data, b"DATA ", path)
-    values, names = read_data(parse_header(lines, path), data[offset:], path)
+    values, names = read_data(parse_header(lines, path), memoryview(data)[offset:], path)
     return Cloud(values, tuple(names))
 
 
-def _table(data: bytes, count: int, names: list[str], types: list[str], text: bool, path: Path) -> Cloud:
+def _table(data: bytes, offset: int, count: int, names: list[str], types: list[str], text: bool, path: Path) -> Cloud:
     """The rows behind a header, as float32 columns."""
     if count < 0:
         raise DataError(path, "a number of points", f"{count}")
     if text:
-        words = data.split()[: count * len(names)]
+        words = data[offset:].split()[: count * len(names)]
         if len(words) != count * len(names):
             raise DataError(path, f"{count} points of {len(names)} values", f"{len(words)} values")
         try:
-            values = np.array(words, dtype=np.float64).reshape(count, len(names))
+            table = np.array(words, dtype=np.float64).reshape(count, len(names))
         except ValueError as error:
             raise DataError(path, "numbers", str(error)) from None
-        return Cloud(values.astype(np.float32), tuple(names))
+        return Cloud(table.astype(np.float32), tuple(names))
     row = np.dtype([(f"c{index}", kind) for index, kind in enumerate(types)])
-    if len(data) < count * row.itemsize:
-        raise DataError(path, f"{count} points of {row.itemsize} bytes", f"{len(data)} bytes", "the file is truncated")
-    rows = np.frombuffer(data, dtype=row, count=count)
-    columns = [rows[f"c{index}"].astype(np.float32) for index in range(len(names))]
-    return Cloud(np.column_stack(columns) if columns else np.zeros((count, 0), np.float32), tuple(names))
+    rest = len(data) - offset
+    if rest < count * row.itemsize:
+        raise DataError(path, f"{count} points of {row.itemsize} bytes", f"{rest} bytes", "the file is truncated")
+    rows = np.frombuffer(data, row, count, offset) if count else np.zeros(0, row)
+    values = np.empty((count, len(names)), np.float32)
+    for index in range(len(names)):
+        values[:, index] = rows[f"c{index}"]
+    return Cloud(values, tuple(names))

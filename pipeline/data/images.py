@@ -40,7 +40,15 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
         raise DataError(path, "a PNG or JPEG image", "data that cannot be decoded")
     if image.dtype == np.uint16:
         image = _eight_bits(image, path)
-    return np.ascontiguousarray(image[:, :, ::-1])
+    return _with_red_first(image)
+
+
+def _with_red_first(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """OpenCV's blue, green, red exchanged where they lie."""
+    blue = image[:, :, 0].copy()
+    image[:, :, 0] = image[:, :, 2]
+    image[:, :, 2] = blue
+    return image
 
 
 def _eight_bits(image: NDArray[Any], path: Path) -> NDArray[np.uint8]:

@@ -75,23 +75,26 @@ def parse_header(lines: list[str], path: Path) -> PcdHeader:
     return PcdHeader(names, types, counts, points, kind)
 
 
-def read_data(header: PcdHeader, data: bytes, path: Path) -> tuple[NDArray[np.float32], list[str]]:
+def read_data(header: PcdHeader, data: memoryview, path: Path) -> tuple[NDArray[np.float32], list[str]]:
     """(points, columns) float32 values and the names of the columns behind a header."""
     columns = header.columns
     names = [name for _, _, name in columns]
     if header.kind == "ascii":
-        return _ascii(header, data, path), names
+        return _ascii(header, data.tobytes(), path), names
     if header.kind == "binary":
         size = header.points * header.row.itemsize
         if len(data) < size:
             expected = f"{header.points} points of {header.row.itemsize} bytes"
             raise DataError(path, expected, f"{len(data)} bytes", "the file is truncated")
         rows = np.frombuffer(data[:size], dtype=header.row, count=header.points if size else 0)
-        values = [rows[f"f{i}"][:, k].astype(np.float32) for i, k, _ in columns]
+        values = [rows[f"f{i}"][:, k] for i, k, _ in columns]
     else:
         fields = _decompressed_fields(header, data, path)
-        values = [fields[i][:, k].astype(np.float32) for i, k, _ in columns]
-    return np.column_stack(values) if values else np.zeros((header.points, 0), np.float32), names
+        values = [fields[i][:, k] for i, k, _ in columns]
+    points = np.empty((header.points, len(values)), np.float32)
+    for index, column in enumerate(values):
+        points[:, index] = column
+    return points, names
 
 
 def _ascii(header: PcdHeader, data: bytes, path: Path) -> NDArray[np.float32]:
@@ -108,7 +111,7 @@ def _ascii(header: PcdHeader, data: bytes, path: Path) -> NDArray[np.float32]:
     return table[:, [int(starts[i]) + k for i, k, _ in header.columns]].astype(np.float32)
 
 
-def _decompressed_fields(header: PcdHeader, data: bytes, path: Path) -> dict[int, NDArray[Any]]:
+def _decompressed_fields(header: PcdHeader, data: memoryview, path: Path) -> dict[int, NDArray[Any]]:
     """Field -> (points, count) values: compressed data holds one field after the other, padding mostly left out."""
     packed, unpacked = struct.unpack_from("<II", data) if len(data) >= 8 else (0, 0)
     sizes = [np.dtype(kind).itemsize * count * header.points for kind, count in zip(header.types, header.counts)]

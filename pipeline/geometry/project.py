@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from pipeline.geometry.calibration import Calibration
 from pipeline.geometry.in_view import pixels_and_depth
 
+# Points whose pixels and depths are in memory together: a cloud of 500 MB would take as much again.
+_AT_ONCE = 1 << 20
+
 
 def project_points(
     points: NDArray[np.floating], calibration: Calibration, image_size: tuple[int, int]
@@ -18,9 +21,10 @@ def project_points(
     points never overwrite near ones (official `velodyne_raw` maps are made the same way, but ego-motion corrected).
     """
     height, width = image_size
-    pixels, depth = pixels_and_depth(points, calibration, image_size)
-    seen = pixels >= 0
     nearest = np.full(height * width, np.inf, dtype=np.float32)
-    np.minimum.at(nearest, pixels[seen], depth[seen].astype(np.float32))
+    for start in range(0, len(points), _AT_ONCE):
+        pixels, depth = pixels_and_depth(points[start : start + _AT_ONCE], calibration, image_size)
+        seen = pixels >= 0
+        np.minimum.at(nearest, pixels[seen], depth[seen].astype(np.float32))
     nearest[np.isinf(nearest)] = 0
     return nearest.reshape(height, width)

@@ -151,6 +151,15 @@ class RunConfig(Section):
     keep_going: bool = Field(default=True, description="process the other frames when one fails")
 
 
+class LimitsConfig(Section):
+    """What one frame may take; beyond it the frame is refused and the others go on. Nothing here changes a result."""
+
+    file_mb: float = Field(default=512, gt=0, le=512, description="largest file of a frame that is read")
+    memory_gb: float | None = Field(
+        default=None, gt=0, description="memory that the work on one frame may take beside the program (Linux)"
+    )
+
+
 class Config(Section):
     """A whole run."""
 
@@ -164,6 +173,7 @@ class Config(Section):
     report: ReportConfig = ReportConfig()
     train: TrainConfig = TrainConfig()
     run: RunConfig = RunConfig()
+    limits: LimitsConfig = LimitsConfig()
     made_with: dict[str, str | None] | None = Field(
         default=None, description="versions and git commit, written by the program"
     )

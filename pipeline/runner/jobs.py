@@ -10,6 +10,7 @@ from typing import Any
 from pipeline.base.disk import why_full
 from pipeline.base.errors import DataError, UsageError
 from pipeline.run_folder.frame_outputs import Written
+from pipeline.runner.limits import is_out_of_memory
 
 # Errors after which going on with the next frame would only repeat them.
 _FATAL_ERRNO = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the disk quota is used up", errno.EROFS: "read-only"}
@@ -80,6 +81,9 @@ def outcome_of_error(task: Task, error: BaseException, seconds: float) -> Outcom
         return Outcome(task, {}, seconds, failure)
     if isinstance(error, UsageError):
         return Outcome(task, {}, seconds, _failure(task, "data", found=str(error)))
+    if is_out_of_memory(error):
+        hint = "try fewer --workers, a smaller frame, or a larger limits.memory_gb"
+        return Outcome(task, {}, seconds, _failure(task, "data", "it takes more memory than there is", hint))
     text = "".join(traceback.format_exception(type(error), error, error.__traceback__))
     found = f"{type(error).__name__}: {' '.join(str(error).split())[:500]}"
     return Outcome(task, {}, seconds, _failure(task, "unexpected", found=found, detail=text))

@@ -12,6 +12,7 @@ from pipeline.data import Frame
 from pipeline.run_folder.config import Config
 from pipeline.run_folder.frames import data_root, open_frames
 from pipeline.runner.jobs import Outcome, Task, outcome_of_error
+from pipeline.runner.limits import bounded_memory, check_size
 from pipeline.stages.order import FRAME_STAGES
 from pipeline.stages.stage import FrameStage, Work
 
@@ -34,18 +35,20 @@ class FrameWorker:
         try:
             files = stage.declared_files(self.run_folder, task.frame)
             frame = self.dataset[task.frame]
-            self._check_links(stage, frame)
-            work(stage.declared_frame(frame), files)
+            self._check_files(stage, frame)
+            with bounded_memory(self.config.limits.memory_gb):
+                work(stage.declared_frame(frame), files)
         except Exception as error:
             return outcome_of_error(task, error, time.perf_counter() - start)
         return Outcome(task, files.written, time.perf_counter() - start)
 
-    def _check_links(self, stage: FrameStage, frame: Frame) -> None:
-        """Refuses files that are links out of the data set; a data set from elsewhere must not read other files."""
+    def _check_files(self, stage: FrameStage, frame: Frame) -> None:
+        """Refuses files beyond `limits.file_mb`, and links: a data set from elsewhere must not read other files."""
         root = data_root(self.config, self.run_folder)
         for part in stage.parts(frame):
             for path in frame.files(part):
                 check_inside(path, root)
+                check_size(path, self.config.limits.file_mb)
 
     def _opened(self, name: str) -> tuple[FrameStage, Work]:
         if self._stage is None or self._stage[0] != name:

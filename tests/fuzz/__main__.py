@@ -1,8 +1,9 @@
 """Long fuzzing runs: `python -m tests.fuzz --minutes 10 [--target label]`, CPU minutes per target, one line each.
 
 Memory of the process is limited, so that a reader which takes too much ends with a MemoryError; a reader that computes
-for a minute on one file ends the program with a stack trace. Both, and every error that is no refusal, are finds: the
-file is kept in the folder of `--finds`.
+for a minute on one file ends the program with a stack trace. Readers of pickles and arrays
+work in a process of their own (`child.py`), so that a crash is a find, and may take 1 GB. All of these, and every error
+that is no refusal, are finds: the file is kept in the folder of `--finds`.
 """
 
 from __future__ import annotations

@@ -14,7 +14,10 @@ import numpy as np
 
 from pipeline.base.errors import DataError
 
-MEMORY_BYTES = 2_000_000_000
+# What a reader of arrays may map (the libraries alone take 3 GB with PyTorch), and what it may really take.
+MEMORY_BYTES = 6_000_000_000
+MOST_RESIDENT_BYTES = 1_000_000_000
+HANG_SECONDS = 60.0
 
 
 class ReaderProcess:
@@ -32,6 +35,10 @@ class ReaderProcess:
             self._start()
         assert self._process is not None
         self._pipe.send(path)
+        if not self._pipe.poll(HANG_SECONDS):
+            self._process.kill()
+            self._process = None
+            raise AssertionError(f"no answer within {HANG_SECONDS:.0f} s")
         try:
             refused, error = self._pipe.recv()
         except EOFError:
@@ -58,7 +65,10 @@ def _serve(pipe: Connection, reader: Callable[[Path], object]) -> None:
         except EOFError:
             return
         try:
-            reader(path)
+            try:
+                reader(path)
+            finally:
+                _check_memory()
             pipe.send((False, ""))
         except DataError as error:
             pipe.send((True, str(error)))
@@ -66,11 +76,46 @@ def _serve(pipe: Connection, reader: Callable[[Path], object]) -> None:
             pipe.send((False, f"{type(error).__name__}: {error}"))
 
 
+def _check_memory() -> None:
+    taken = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    assert taken < MOST_RESIDENT_BYTES, f"{taken / 1e6:.0f} MB were taken"
+
+
 def read_infos(path: Path) -> None:
     """Reads an info pickle and looks at every value of it: a wrong pointer is followed only then."""
     from pipeline.check.safe_pickle import load_infos
 
     _look_at(load_infos(path))
+
+
+def read_npz_file(path: Path) -> None:
+    """Reads an .npz as the surfaces of a frame are read."""
+    from pipeline.run_folder.frame_outputs import read_npz
+
+    _look_at(read_npz(path, ("foreground", "sigma")))
+
+
+def read_npy_file(path: Path) -> None:
+    """Reads a .npy as a cloud is read."""
+    from pipeline.data.cloud_files import read_points
+
+    _look_at(read_points(path))
+
+
+def read_torch_file(path: Path) -> None:
+    """Reads a PyTorch checkpoint, zip or legacy, and looks at its tensors."""
+    import torch
+
+    from auglidar_base.errors import CheckpointError
+    from auglidar_base.torch_pickle import read_torch_pickle
+
+    try:
+        contents = read_torch_pickle(path)
+    except CheckpointError as error:
+        raise DataError(path, "a checkpoint", str(error)) from None
+    for value in contents.values() if isinstance(contents, dict) else ():
+        if isinstance(value, torch.Tensor):
+            value.double().sum()
 
 
 def _look_at(value: Any) -> None:

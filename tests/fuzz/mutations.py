@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import struct
+import zipfile
 import zlib
 
 from hypothesis import strategies as st
@@ -39,6 +41,19 @@ def mutated(draw: st.DrawFn, samples: tuple[bytes, ...]) -> bytes:
         elif start < len(data):
             data[start] ^= 1 << draw(st.integers(0, 7))
     return bytes(data)
+
+
+@st.composite
+def zipped(draw: st.DrawFn, samples: tuple[dict[str, bytes], ...]) -> bytes:
+    """Zip files with right checksums around entries of which one is damaged; now and then the zip itself is, too."""
+    entries = dict(draw(st.sampled_from(samples)))
+    name = draw(st.sampled_from(sorted(entries)))
+    entries[name] = draw(mutated((entries[name],)))
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", draw(st.sampled_from((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)))) as archive:
+        for entry, data in entries.items():
+            archive.writestr(entry, data)
+    return draw(mutated((stream.getvalue(),))) if draw(st.integers(0, 3)) == 0 else stream.getvalue()
 
 
 def _replace_word(data: bytearray, start: int, word: bytes) -> None:

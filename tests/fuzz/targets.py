@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import pickle
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -15,8 +17,8 @@ import numpy as np
 from hypothesis import strategies as st
 
 from pipeline.base.errors import DataError, UsageError
-from tests.fuzz.child import ReaderProcess, read_infos
-from tests.fuzz.mutations import mutated, opcodes, png_files
+from tests.fuzz.child import ReaderProcess, read_infos, read_npy_file, read_npz_file, read_torch_file
+from tests.fuzz.mutations import mutated, opcodes, png_files, zipped
 
 
 @dataclass(frozen=True)
@@ -215,8 +217,49 @@ def _pickle_samples() -> tuple[bytes, ...]:
 
 
 @cache
-def _pickle_reader() -> ReaderProcess:
-    return ReaderProcess(read_infos)
+def _npz_samples() -> tuple[bytes, ...]:
+    from pipeline.run_folder.frame_outputs import npz_bytes
+
+    surface = np.arange(48, dtype=np.uint16).reshape(6, 8)
+    return (npz_bytes({"foreground": surface, "sigma": surface.astype(np.uint8)}),)
+
+
+def _npy_samples() -> tuple[bytes, ...]:
+    found = []
+    for array in (np.arange(24, dtype="<f4").reshape(6, 4), np.asfortranarray(np.ones((3, 5), ">f8"))):
+        stream = io.BytesIO()
+        np.save(stream, array)
+        found.append(stream.getvalue())
+    return tuple(found)
+
+
+@cache
+def _torch_samples() -> tuple[bytes, ...]:
+    """A checkpoint as a zip and in the form of before 2020."""
+    import torch
+
+    state = {"a.weight": torch.ones(2, 3), "b": torch.zeros(4, dtype=torch.int64), "epoch": 3}
+    found = []
+    for new in (True, False):
+        stream = io.BytesIO()
+        torch.save(state, stream, _use_new_zipfile_serialization=new)
+        found.append(stream.getvalue())
+    return tuple(found)
+
+
+def _entries(data: bytes) -> dict[str, bytes]:
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def _zips(samples: Callable[[], tuple[bytes, ...]]) -> st.SearchStrategy[bytes]:
+    """Damage in the files and, behind right checksums, in what the zips among them hold."""
+    return mutated(samples()) | zipped(tuple(_entries(data) for data in samples() if data.startswith(b"PK")))
+
+
+@cache
+def _child(reader: Callable[[Path], None]) -> ReaderProcess:
+    return ReaderProcess(reader)
 
 
 def _changed(samples: Callable[[], tuple[bytes, ...]]) -> Callable[[], st.SearchStrategy[bytes]]:
@@ -259,7 +302,12 @@ TARGETS: dict[str, Target] = {
     "ledger": Target(_changed(_ledger_samples), _read_ledger, UsageError, ".sqlite"),
     "checkpoint": Target(_card_and_weights, _read_checkpoint, ValueError, ".both"),
     "pickle": Target(
-        lambda: mutated(_pickle_samples()) | opcodes(), lambda path: _pickle_reader().read(path), DataError, ".pkl"
+        lambda: mutated(_pickle_samples()) | opcodes(), lambda path: _child(read_infos).read(path), DataError, ".pkl"
+    ),
+    "npz": Target(lambda: _zips(_npz_samples), lambda path: _child(read_npz_file).read(path), DataError, ".npz"),
+    "npy": Target(_changed(_npy_samples), lambda path: _child(read_npy_file).read(path), DataError, ".npy"),
+    "torch_pickle": Target(
+        lambda: _zips(_torch_samples), lambda path: _child(read_torch_file).read(path), DataError, ".pth"
     ),
     "safetensors": Target(_changed(_weights_samples), _read_safetensors, ValueError, ".safetensors"),
 }

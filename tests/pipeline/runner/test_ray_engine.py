@@ -6,11 +6,14 @@ import importlib.util
 import os
 import subprocess
 import sys
+import time
+import uuid
 from pathlib import Path
 
 import pytest
 
 from pipeline.cli import main
+from tests.pipeline.left_behind import ENDS_WITHIN, marked, started
 from tests.pipeline.test_cli import AUGMENT, ROOT, contents, done_frames
 from tests.pipeline.tiny_kitti import write_tiny_kitti
 
@@ -45,3 +48,22 @@ def test_a_cluster_of_two_nodes_gives_the_same_bytes_while_a_worker_is_killed(tm
     assert contents(out) == contents(tmp_path / "local")
     assert len(done_frames(out, "augment")) == 10
     assert not (out / "failures.json").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed: pip install 'auglidar[ray]'")
+def test_after_a_killed_driver_nothing_stays(tmp_path: Path) -> None:
+    """Ray ties the nodes it starts for a driver to that driver, and actors end with their nodes."""
+    mark = uuid.uuid4().hex
+    data = write_tiny_kitti(tmp_path / "kitti", 200)
+    program = started(["pipeline.cli", *AUGMENT, "--data", str(data), "--engine", "ray", "--out", str(tmp_path)], mark)
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.glob("cloud/*.bin")) and program.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert program.poll() is None, program.communicate()
+    program.kill()
+    program.communicate()
+    end = time.monotonic() + ENDS_WITHIN
+    while marked(mark) and time.monotonic() < end:
+        time.sleep(0.1)
+    assert marked(mark) == {}

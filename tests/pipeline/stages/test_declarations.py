@@ -171,7 +171,7 @@ CHANGES: tuple[tuple[str | None, str, Any, set[str]], ...] = (
     ("detection", "device", "cuda", {"detect"}),
     ("detection", "options", {"scale": 2}, {"detect"}),
 )
-SHAPES_NOTHING = {"data", "synth", "evaluation", "report", "train", "run", "made_with"}
+SHAPES_NOTHING = {"data", "synth", "evaluation", "report", "train", "run", "limits", "made_with"}
 
 
 def changed(config: Config, section: str | None, name: str, value: Any) -> Config:
