@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -34,6 +35,39 @@ def foreground_loss(logits: Tensor, labels: Tensor) -> Tensor:
     loss = sigmoid_focal(logits, targets)
     kept = (labels >= 0).to(logits.dtype).unsqueeze(-1)
     return (loss * kept).sum() / (labels > 0).sum().clamp(min=1)
+
+
+def dice_loss(logits: Tensor, labels: Tensor) -> Tensor:
+    """PointRCNN's DiceLoss: 1 - sum min(p, t) / max(sum max(p, t), 1) over all points that are not ignored.
+
+    logits (B, N) or (B, N, 1), p = sigmoid        labels (B, N) int64: 0 background (t = 0), 1 (t = 1), -1 ignored
+    """
+    probability, kept = logits.reshape(labels.shape).sigmoid(), labels >= 0
+    probability, target = probability[kept], (labels[kept] > 0).to(logits.dtype)
+    union = torch.maximum(probability, target).sum().clamp(min=1.0)
+    return 1.0 - torch.minimum(probability, target).sum() / union
+
+
+def weighted_bce(logits: Tensor, labels: Tensor, foreground_weight: float = 15.0) -> Tensor:
+    """PointRCNN's BinaryCrossEntropy: foreground counts `foreground_weight` times (FG_WEIGHT), mean over labels >= 0.
+
+    logits (B, N) or (B, N, 1)        labels (B, N) int64: 0 background, 1 foreground, -1 ignored
+    The sum is divided by the number of points, not by their weights.
+    """
+    kept = labels >= 0
+    target = (labels[kept] > 0).to(logits.dtype)
+    weight = 1.0 + (foreground_weight - 1.0) * target
+    logits = logits.reshape(labels.shape)[kept]
+    loss = F.binary_cross_entropy_with_logits(logits, target, weight=weight, reduction="sum")
+    return loss / kept.sum().clamp(min=1)
+
+
+# PointRCNN's RPN.LOSS_CLS: SigmoidFocalLoss (its configuration), DiceLoss, BinaryCrossEntropy.
+SEGMENTATION_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "focal": foreground_loss,
+    "dice": dice_loss,
+    "bce": weighted_bce,
+}
 
 
 @dataclass(frozen=True)
@@ -74,17 +108,35 @@ def bin_box_loss(code: Tensor, targets: BinTargets, coder: BinCoder) -> BoxLoss:
     return BoxLoss(location, heading, F.smooth_l1_loss(size_res, targets.size_res))
 
 
-def aligned_iou(code: Tensor, targets: BinTargets, sizes: Tensor, mean_sizes: Tensor, coder: BinCoder) -> Tensor:
+def _of_target_bins(code: Tensor, targets: BinTargets, coder: BinCoder) -> tuple[Tensor, Tensor]:
+    """(R,) x and z in metres where the residuals of the target bins put them, whatever the bins' logits."""
+    _, _, x_res, z_res, *_ = coder.split(code)
+    centres = coder.bin_centres(code)
+    x = centres[targets.x_bin] + _of_bin(x_res, targets.x_bin) * coder.bin_size
+    z = centres[targets.z_bin] + _of_bin(z_res, targets.z_bin) * coder.bin_size
+    return x, z
+
+
+def _expected(code: Tensor, coder: BinCoder) -> tuple[Tensor, Tensor]:
+    """(R,) x and z in metres as the expectations over the bins."""
+    x_bin, z_bin, x_res, z_res, *_ = coder.split(code)
+    return coder.expected_location(x_bin, x_res), coder.expected_location(z_bin, z_res)
+
+
+def aligned_iou(
+    code: Tensor, targets: BinTargets, sizes: Tensor, mean_sizes: Tensor, coder: BinCoder, raw: bool = False
+) -> Tensor:
     """(R,) overlap of coded boxes and their targets as EPNet takes it (sec. 3.4), differentiable.
 
     sizes  (R, 3) true h w l in metres      mean_sizes  (3,) or (R, 3)
-    Axis-aligned in the local frame: l along x, h along y, w along z, headings left out; the predicted x and z are the
-    expectations over the bins. Overlaps are clamped to 1e-3 per axis, the predicted volume to 1e-3.
+    raw    the predicted x and z are those of the target bins (EPNet's IOU_LOSS_TYPE raw), not the expectations over
+           the bins (its cls_mask_with_bin)
+    Axis-aligned in the local frame: l along x, h along y, w along z, headings left out. Overlaps are clamped to 1e-3
+    per axis, the predicted volume to 1e-3.
     """
-    x_bin, z_bin, x_res, z_res, y, _, _, size_res = coder.split(code)
-    predicted = torch.stack(
-        [coder.expected_location(x_bin, x_res), y.squeeze(1), coder.expected_location(z_bin, z_res)], dim=1
-    )
+    x, z = _of_target_bins(code, targets, coder) if raw else _expected(code, coder)
+    *_, y, _, _, size_res = coder.split(code)
+    predicted = torch.stack([x, y.squeeze(1), z], dim=1)
     centres = coder.bin_centres(code)
     true_x = centres[targets.x_bin] + targets.x_res * coder.bin_size
     true_z = centres[targets.z_bin] + targets.z_res * coder.bin_size
@@ -100,7 +152,13 @@ def aligned_iou(code: Tensor, targets: BinTargets, sizes: Tensor, mean_sizes: Te
 
 
 def consistency_loss(
-    logits: Tensor, code: Tensor, targets: BinTargets, sizes: Tensor, mean_sizes: Tensor, coder: BinCoder
+    logits: Tensor,
+    code: Tensor,
+    targets: BinTargets,
+    sizes: Tensor,
+    mean_sizes: Tensor,
+    coder: BinCoder,
+    raw: bool = False,
 ) -> Tensor:
     """EPNet's consistency enforcing loss (sec. 3.4): mean of -log(max(c * IoU, 1e-4)) over R rows.
 
@@ -108,7 +166,7 @@ def consistency_loss(
     """
     if len(code) == 0:
         return code.sum() * 0.0
-    iou = aligned_iou(code, targets, sizes, mean_sizes, coder)
+    iou = aligned_iou(code, targets, sizes, mean_sizes, coder, raw)
     return -(logits.sigmoid() * iou).clamp(min=1e-4).log().mean()
 
 

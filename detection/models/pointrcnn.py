@@ -8,8 +8,16 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from auglidar_base.errors import SettingsError
 from detection.data_augmentation import augment_regions
-from detection.losses import aligned_iou, bin_box_loss, consistency_loss, foreground_loss, iou_branch_loss, masked_bce
+from detection.losses import (
+    SEGMENTATION_LOSSES,
+    aligned_iou,
+    bin_box_loss,
+    consistency_loss,
+    iou_branch_loss,
+    masked_bce,
+)
 from detection.models.batch import PointBatch, RawDetections
 from detection.models.box_coding import MEAN_SIZES, boxes_from_points, boxes_from_rois, rotate_y, to_roi_frame
 from detection.models.proposals import Proposals, ProposalSettings, propose
@@ -32,6 +40,8 @@ class PointRCNNSettings:
     pool_margin         metres added on every side of a RoI before pooling
     head_width          of the second stage's heads       iou_branch  EPNet's third head
     roi_augmentation    random scale and mirror of each training RoI (AUG_DATA)
+    segmentation_loss   of the points: focal, dice or bce (LOSS_CLS)
+    raw_iou             the IoU of the consistency loss takes x and z from the target bins (IOU_LOSS_TYPE raw)
     """
 
     extra_channels: int
@@ -46,6 +56,13 @@ class PointRCNNSettings:
     proposals_train: ProposalSettings
     proposals_test: ProposalSettings
     rois: RoiSamplingSettings
+    segmentation_loss: str = "focal"
+    raw_iou: bool = False
+
+    def __post_init__(self) -> None:
+        if self.segmentation_loss not in SEGMENTATION_LOSSES:
+            known = ", ".join(SEGMENTATION_LOSSES)
+            raise SettingsError(f"segmentation_loss: expected one of {known}, got {self.segmentation_loss!r}")
 
 
 @dataclass(frozen=True)
@@ -64,7 +81,8 @@ class PointRCNN(nn.Module):
     def __init__(self, settings: PointRCNNSettings) -> None:
         super().__init__()
         self.settings = settings
-        self.rpn = RPN(settings.extra_channels, settings.fine_location)
+        rare_foreground = settings.segmentation_loss == "focal"
+        self.rpn = RPN(settings.extra_channels, settings.fine_location, rare_foreground)
         self.rcnn_net = RCNN(settings.head_width, settings.iou_branch)
         self.register_buffer("mean_size", torch.tensor(MEAN_SIZES["Car"]), persistent=False)
         self.mean_size: Tensor
@@ -121,10 +139,12 @@ class PointRCNN(nn.Module):
         coder, code = self.rpn.coder, rpn.reg[chosen]
         targets = coder.encode(centres - batch.points[..., :3][chosen], truth[:, 3:6], truth[:, 6], self.mean_size)
         loss = bin_box_loss(code, targets, coder)
-        losses = {"rpn_cls": foreground_loss(rpn.cls, labels), "rpn_reg": loss.total()}
+        segmentation = SEGMENTATION_LOSSES[self.settings.segmentation_loss]
+        losses = {"rpn_cls": segmentation(rpn.cls, labels), "rpn_reg": loss.total()}
         if self.settings.consistency_weight:
             logits = rpn.cls.squeeze(-1)[chosen]
-            agreement = consistency_loss(logits, code, targets, truth[:, 3:6], self.mean_size, coder)
+            raw = self.settings.raw_iou
+            agreement = consistency_loss(logits, code, targets, truth[:, 3:6], self.mean_size, coder, raw)
             losses["rpn_consistency"] = self.settings.consistency_weight * agreement
         return losses
 
@@ -153,11 +173,12 @@ class PointRCNN(nn.Module):
             "rcnn_cls": masked_bce(logits, classification_labels(iou, empty.flatten())),
             "rcnn_reg": bin_box_loss(code, targets, coder).total(),
         }
+        raw = self.settings.raw_iou
         if self.settings.consistency_weight:
-            agreement = consistency_loss(logits[valid], code, targets, local[:, 3:6], self.mean_size, coder)
+            agreement = consistency_loss(logits[valid], code, targets, local[:, 3:6], self.mean_size, coder, raw)
             losses["rcnn_consistency"] = self.settings.consistency_weight * agreement
         if out.iou is not None:
-            overlap = aligned_iou(code, targets, local[:, 3:6], self.mean_size, coder)
+            overlap = aligned_iou(code, targets, local[:, 3:6], self.mean_size, coder, raw)
             losses["rcnn_iou"] = iou_branch_loss(out.iou.squeeze(1)[valid], overlap)
         return losses
 

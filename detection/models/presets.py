@@ -54,8 +54,11 @@ def _published(name: str, settings: PointRCNNSettings, inputs: InputSettings, op
     return Preset(name, ("Car",), inputs, outputs, lambda: PointRCNN(settings), options)
 
 
-def pointrcnn(fine_location: bool = False, features: tuple[str, ...] = ()) -> Preset:
-    """PointRCNN (Shi et al. 2019). The released weights lack residuals per bin (fine_location False, 52 channels)."""
+def pointrcnn(fine_location: bool = False, features: tuple[str, ...] = (), segmentation_loss: str = "focal") -> Preset:
+    """PointRCNN (Shi et al. 2019). The released weights lack residuals per bin (fine_location False, 52 channels).
+
+    segmentation_loss  of the points in training: focal, dice or bce (RPN.LOSS_CLS)
+    """
     settings = PointRCNNSettings(
         extra_channels=len(features),
         fine_location=fine_location,
@@ -69,8 +72,9 @@ def pointrcnn(fine_location: bool = False, features: tuple[str, ...] = ()) -> Pr
         proposals_train=_NEAR_FAR_TRAIN,
         proposals_test=_NEAR_FAR_TEST,
         rois=RoiSamplingSettings(),
+        segmentation_loss=segmentation_loss,
     )
-    options = {"fine_location": fine_location, "features": list(features)}
+    options = {"fine_location": fine_location, "features": list(features), "segmentation_loss": segmentation_loss}
     return _published("pointrcnn", settings, InputSettings(16384, "near_far", tuple(features)), options)
 
 
@@ -91,10 +95,18 @@ def _epnet_settings(features: tuple[str, ...], iou_branch: bool) -> PointRCNNSet
     )
 
 
-def pointrcnn2(features: tuple[str, ...] = (), iou_branch: bool = False) -> Preset:
-    """EPNet without image fusion, the thesis' "PointRCNN2", with the values of the released code."""
+def pointrcnn2(
+    features: tuple[str, ...] = (), iou_branch: bool = False, segmentation_loss: str = "focal", raw_iou: bool = False
+) -> Preset:
+    """EPNet without image fusion, the thesis' "PointRCNN2", with the values of the released code.
+
+    segmentation_loss  of the points in training: focal, dice or bce (RPN.LOSS_CLS)
+    raw_iou            the consistency loss takes x and z from the target bins (IOU_LOSS_TYPE raw)
+    """
     settings = _epnet_settings(tuple(features), iou_branch)
-    options = {"features": list(features), "iou_branch": iou_branch}
+    settings = replace(settings, segmentation_loss=segmentation_loss, raw_iou=raw_iou)
+    options: dict[str, Any] = {"features": list(features), "iou_branch": iou_branch}
+    options |= {"segmentation_loss": segmentation_loss, "raw_iou": raw_iou}
     return _published("pointrcnn2", settings, InputSettings(16384, "near_far", tuple(features)), options)
 
 

@@ -23,9 +23,12 @@ class RPNOutput:
 
 
 class RPN(nn.Module):
-    """PointNet++ with two heads (PointRCNN, Shi et al. 2019, sec. 3.1-3.2)."""
+    """PointNet++ with two heads (PointRCNN, Shi et al. 2019, sec. 3.1-3.2).
 
-    def __init__(self, extra_channels: int, fine_location: bool) -> None:
+    rare_foreground  before training every point is foreground with probability 0.01 (for the focal loss); else 0.5
+    """
+
+    def __init__(self, extra_channels: int, fine_location: bool, rare_foreground: bool = True) -> None:
         super().__init__()
         self.coder = rpn_coder(fine_location)
         self.backbone_net = PointNet2Backbone(extra_channels)
@@ -33,7 +36,7 @@ class RPN(nn.Module):
         self.rpn_cls_layer = prediction_head(channels, [128], 1, norm=True, dropout=0.5)
         self.rpn_reg_layer = prediction_head(channels, [128], self.coder.channels, norm=True, dropout=0.5)
         bias = cast(PointLayer, self.rpn_cls_layer[2]).conv.bias
-        nn.init.constant_(cast(Tensor, bias), -math.log(0.99 / 0.01))
+        nn.init.constant_(cast(Tensor, bias), -math.log(0.99 / 0.01) if rare_foreground else 0.0)
         nn.init.normal_(cast(PointLayer, self.rpn_reg_layer[2]).conv.weight, std=0.001)
 
     def forward(self, points: Tensor) -> RPNOutput:

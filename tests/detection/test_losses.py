@@ -14,11 +14,13 @@ from detection.losses import (
     box_corners,
     consistency_loss,
     corner_loss,
+    dice_loss,
     foreground_loss,
     iou_branch_loss,
     masked_bce,
     sigmoid_focal,
     smooth_l1,
+    weighted_bce,
 )
 from detection.models.box_coding import MEAN_SIZES, rcnn_coder, rpn_coder
 from tests.reference import detection_losses as twin
@@ -146,3 +148,55 @@ def test_the_iou_branch_learns_the_aligned_iou_without_headings() -> None:
     assert code.grad is None
     # No sigmoid: what lies outside [1e-4, 0.9999] is clamped.
     assert iou_branch_loss(raw.detach() - 3, iou).item() == pytest.approx(-0.6 * math.log(1e-4), rel=1e-3)
+
+
+def _logits(probabilities: list[float]) -> torch.Tensor:
+    return torch.tensor([probabilities], dtype=torch.float64).logit().requires_grad_()
+
+
+def test_dice_loss_by_hand() -> None:
+    # Shared 0.8 + 0 (minima), union 1 + 0.5 (maxima); the ignored point counts in neither: 1 - 0.8 / 1.5.
+    logits = _logits([0.8, 0.5, 0.9])
+    loss = dice_loss(logits, torch.tensor([[1, 0, -1]]))
+    assert loss.item() == pytest.approx(1 - 0.8 / 1.5)
+    loss.backward()
+    assert logits.grad is not None
+    # d/dp: -1 / 1.5 and +0.8 / 1.5^2; dp/dlogit = p (1 - p).
+    assert logits.grad[0].tolist() == pytest.approx([-0.16 / 1.5, 0.25 * 0.8 / 2.25, 0])
+    # A union below one counts as one.
+    assert dice_loss(_logits([0.25, 0.5]), torch.tensor([[0, 0]])).item() == 1
+    assert dice_loss(_logits([0.25])[..., None], torch.tensor([[-1]])).item() == 1
+
+
+def test_weighted_bce_by_hand() -> None:
+    # 15 times -ln 0.8 and once -ln(1 - 0.5), over two points.
+    logits = _logits([0.8, 0.5, 0.9])
+    loss = weighted_bce(logits[..., None], torch.tensor([[1, 0, -1]]))
+    assert loss.item() == pytest.approx((-15 * math.log(0.8) - math.log(0.5)) / 2)
+    loss.backward()
+    assert logits.grad is not None
+    assert logits.grad[0].tolist() == pytest.approx([15 * (0.8 - 1) / 2, 0.5 / 2, 0])
+    assert weighted_bce(logits, torch.tensor([[-1, -1, -1]])).item() == 0
+
+
+def test_the_raw_iou_takes_the_residuals_of_the_target_bins() -> None:
+    # All bins alike: the expectation is 0, the target bins' centres are 0.25. A perfect size and a residual of half a
+    # bin put the box 0.25 m off along x: 3.75 of 4 m shared, IoU 3.75 / 4.25.
+    coder = rcnn_coder()
+    mean = torch.tensor([1.5, 2.0, 4.0], dtype=torch.float64)
+    box = torch.tensor([[0.25, 0.0, 0.25, 1.5, 2.0, 4.0, 0.0]], dtype=torch.float64)
+    targets = coder.encode(box[:, :3], box[:, 3:6], box[:, 6], mean)
+    code = torch.zeros(1, coder.channels, dtype=torch.float64)
+    code[0, 12 + 3] = 0.5  # x residual of the bin [0, 0.5) m
+    code.requires_grad_()
+    logits = torch.zeros(1, dtype=torch.float64)
+    loss = consistency_loss(logits, code, targets, box[:, 3:6], mean, coder, raw=True)
+    assert loss.item() == pytest.approx(-math.log(0.5 * 3.75 / 4.25))
+    assert consistency_loss(logits, code, targets, box[:, 3:6], mean, coder).item() != pytest.approx(loss.item())
+    loss.backward()
+    assert code.grad is not None
+    x_bin, z_bin, x_res, *_ = coder.split(code.grad)
+    assert not x_bin.any()
+    assert not z_bin.any()
+    # d IoU / dx = -(w h (V + V)) / (V + V - I)^2 with V = 12, I = 11.25, w h = 3: -72 / 12.75^2; 0.5 m per residual.
+    assert x_res[0].tolist() == pytest.approx([0, 0, 0, 0.5 * 72 / 12.75**2 * 4.25 / 3.75, 0, 0])

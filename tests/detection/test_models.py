@@ -7,10 +7,14 @@ import pytest
 import torch
 from torch import nn
 
+from auglidar_base.errors import SettingsError
+from detection.losses import dice_loss
+from detection.models.batch import PointBatch
 from detection.models.openpcdet_pointrcnn import OpenPCDetPointRCNN
 from detection.models.pointrcnn import PointRCNN, canonical
 from detection.models.presets import PRESETS, pointrcnn, pointrcnn2, thesis
 from detection.models.warm_start import copy_matching
+from detection.targets import point_labels
 from tests.reference import pointrcnn_twin as twin
 
 BACKBONE = [
@@ -267,3 +271,26 @@ def test_the_thesis_trains_on_512_proposals_and_tests_on_64() -> None:
     settings = thesis().build().settings
     assert (settings.proposals_train.after, settings.proposals_test.after, settings.rois.rois) == (512, 64, 64)
     assert settings.proposals_train.before == settings.proposals_test.before == 8000
+
+
+def test_the_losses_of_the_options_are_those_that_train() -> None:
+    plain = pointrcnn2().build().eval()
+    chosen = pointrcnn2(segmentation_loss="dice", raw_iou=True)
+    model = PRESETS[chosen.name](**chosen.options).build().eval()
+    assert model.rpn.rpn_cls_layer[2].conv.bias.item() == 0  # no rare foreground to begin with, unlike the focal loss
+    model.load_state_dict(plain.state_dict())
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(1, 600, 3, generator=generator) * torch.tensor([8.0, 2.0, 8.0]) + torch.tensor([-4.0, 0, 6])
+    car = torch.tensor([[0.0, 2.0, 10.0, 1.6, 1.7, 4.0, 0.3]])
+    batch = PointBatch(points, [points[0]], [car], [torch.ones(1, dtype=torch.long)])
+    losses = [network.training_losses(batch, np.random.default_rng(0)) for network in (plain, model)]
+    labels = point_labels(points[0], car, batch.classes[0])[0][None]
+    assert losses[1]["rpn_cls"].item() == pytest.approx(dice_loss(plain.rpn(points).cls, labels).item(), rel=1e-5)
+    assert losses[1]["rpn_cls"].item() != pytest.approx(losses[0]["rpn_cls"].item(), rel=0.01)
+    assert losses[1]["rpn_consistency"].item() != pytest.approx(losses[0]["rpn_consistency"].item(), rel=0.01)
+    assert losses[1]["rpn_reg"].item() == pytest.approx(losses[0]["rpn_reg"].item(), rel=1e-5)
+
+
+def test_an_unknown_segmentation_loss_is_refused_by_name() -> None:
+    with pytest.raises(SettingsError, match="segmentation_loss: expected one of focal, dice, bce, got 'lovasz'"):
+        pointrcnn(segmentation_loss="lovasz")
