@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import pickle
-from collections import OrderedDict
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
 from auglidar_base.torch_pickle import read_torch_pickle
 from detection.checkpoints import (
@@ -23,8 +22,8 @@ from detection.checkpoints import (
     save_tensors,
 )
 from detection.importers import import_with_report
-from detection.models.openpcdet_pointrcnn import OpenPCDetPointRCNN
-from detection.models.presets import pointrcnn, pointrcnn2, small
+from detection.models.presets import small
+from tests.reference import public_detector_keys as public
 
 
 def save_small(folder: Path) -> Path:
@@ -77,18 +76,10 @@ def test_a_truncated_file_is_named(tmp_path) -> None:
         load_tensors(path)
 
 
-def public_state(model: nn.Module, seed: int = 0) -> OrderedDict[str, torch.Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    return OrderedDict(
-        (name, torch.randn(value.shape, generator=generator) if value.is_floating_point() else value.clone())
-        for name, value in model.state_dict().items()
-    )
-
-
 @pytest.mark.parametrize("legacy", [True, False])
-@pytest.mark.parametrize(("fine", "codes"), [(False, 52), (True, 76)])
-def test_pointrcnn_is_told_apart_by_its_codes(tmp_path, fine, codes, legacy) -> None:
-    state = public_state(pointrcnn(fine_location=fine).build())
+@pytest.mark.parametrize("codes", [52, 76])
+def test_pointrcnn_is_told_apart_by_its_codes(tmp_path, codes, legacy) -> None:
+    state = public.filled(public.pointrcnn(codes, 256))
     path = tmp_path / "PointRCNN.pth"
     container = {"epoch": 70, "it": 1000, "model_state": state, "optimizer_state": {"state": {}, "param_groups": []}}
     torch.save(container, path, _use_new_zipfile_serialization=not legacy)
@@ -100,8 +91,24 @@ def test_pointrcnn_is_told_apart_by_its_codes(tmp_path, fine, codes, legacy) -> 
     assert not model.training
 
 
+@pytest.mark.parametrize(
+    ("shapes", "entries", "parameters"),
+    [
+        (public.pointrcnn(52, 256), 244, 3_884_356),
+        (public.pointrcnn(76, 512), 244, 4_555_868),
+        (public.openpcdet_pointrcnn(), 309, 4_038_819),
+        (public.openpcdet_pointpillar(), 127, 4_834_888),
+        (public.openpcdet_second(), 163, 5_325_576),
+    ],
+)
+def test_the_written_key_lists_have_the_published_numbers(shapes, entries, parameters) -> None:
+    counted = (name for name in shapes if not name.endswith(("mean", "var", "tracked", "global_step")))
+    assert len(shapes) == entries
+    assert sum(math.prod(shapes[name]) for name in counted) == parameters
+
+
 def test_data_parallel_prefix_and_missing_counters(tmp_path) -> None:
-    state = public_state(pointrcnn2(features=("intensity",)).build())
+    state = public.filled(public.pointrcnn(76, 512, extra=1))
     trimmed = {f"module.{n}": v for n, v in state.items() if not n.endswith("num_batches_tracked")}
     torch.save(trimmed, tmp_path / "a.pth")
     model, report = import_with_report(tmp_path / "a.pth", "epnet")
@@ -112,12 +119,12 @@ def test_data_parallel_prefix_and_missing_counters(tmp_path) -> None:
 
 
 def test_epnet_with_iou_branch(tmp_path) -> None:
-    torch.save({"model_state": public_state(pointrcnn2(iou_branch=True).build())}, tmp_path / "a.pth")
+    torch.save({"model_state": public.filled(public.pointrcnn(76, 512, iou_branch=True))}, tmp_path / "a.pth")
     assert import_checkpoint(tmp_path / "a.pth", "epnet").rcnn_net.iou_branch is not None
 
 
 def test_fusion_checkpoint_is_refused_with_the_reason(tmp_path) -> None:
-    state = public_state(pointrcnn2().build())
+    state = public.filled(public.pointrcnn(76, 512))
     state["rpn.backbone_net.Img_Block.0.conv1.weight"] = torch.zeros(64, 3, 3, 3)
     state["rpn.backbone_net.Fusion_Conv.0.conv1.bias"] = torch.zeros(96)
     torch.save({"model_state": state}, tmp_path / "a.pth")
@@ -126,7 +133,7 @@ def test_fusion_checkpoint_is_refused_with_the_reason(tmp_path) -> None:
 
 
 def test_openpcdet_with_and_without_singleton_axes(tmp_path) -> None:
-    state = public_state(OpenPCDetPointRCNN())
+    state = public.filled(public.openpcdet_pointrcnn())
     squeezed = {n: v.flatten(1) if n.startswith("backbone_3d") and v.dim() == 4 else v for n, v in state.items()}
     torch.save({"model_state": squeezed, "optimizer_state": None, "version": "pcdet+0.6.0"}, tmp_path / "a.pth")
     model, report = import_with_report(tmp_path / "a.pth", "openpcdet_pointrcnn")
@@ -136,8 +143,19 @@ def test_openpcdet_with_and_without_singleton_axes(tmp_path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("architecture", "shapes"), [("pointpillar", public.openpcdet_pointpillar()), ("second", public.openpcdet_second())]
+)
+def test_openpcdet_by_its_written_keys(tmp_path, architecture, shapes) -> None:
+    state = public.filled(shapes)
+    torch.save({"model_state": state, "version": "pcdet+0.6.0"}, tmp_path / "a.pth")
+    model, report = import_with_report(tmp_path / "a.pth", architecture)
+    assert set(report.consumed) == set(state)
+    assert all(torch.equal(value, state[name]) for name, value in model.state_dict().items())
+
+
 def test_what_does_not_fit_is_listed(tmp_path) -> None:
-    state = public_state(pointrcnn().build())
+    state = public.filled(public.pointrcnn(52, 256))
     state["rcnn_net.extra"] = state.pop("rcnn_net.cls_layer.3.conv.bias")
     state["rpn.rpn_cls_layer.0.conv.weight"] = torch.zeros(128, 64, 1)
     torch.save(state, tmp_path / "a.pth")
