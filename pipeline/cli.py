@@ -11,6 +11,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
+from concurrent.futures import BrokenExecutor
 from typing import Any
 
 from pipeline.base.disk import why_full
@@ -58,6 +59,9 @@ def _answered(arguments: list[str]) -> int:
     except OSError as error:
         what = why_full(error.filename) if error.errno == errno.ENOSPC else error.strerror or str(error)
         print(f"run_pipeline: {f'{error.filename}: ' if error.filename else ''}{what}", file=sys.stderr)
+        return 2
+    except BrokenExecutor:
+        print("run_pipeline: a worker process was ended (out of memory? try fewer --workers)", file=sys.stderr)
         return 2
     except MemoryError:
         print("run_pipeline: there is not enough memory; try fewer --workers", file=sys.stderr)

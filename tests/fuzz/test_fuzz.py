@@ -41,6 +41,7 @@ def test_cards_that_were_found_once(place: tuple[str, ...], value: object) -> No
 @pytest.mark.parametrize(
     ("name", "data"),
     [
+        ("torch_pickle", b"\x80\x02X\x00"),
         ("ply", b"ply\nformat\nelement vertex 1\nproperty float x\nend_header\n"),
         ("ply", b"ply\nformat ascii 1.0\nelement vertex many\nproperty float x\nend_header\n"),
         ("ply", b"ply\nformat binary_little_endian 1.0\nelement vertex -1\nproperty float x\nend_header\n1234"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import pytest
@@ -107,7 +108,11 @@ def test_a_full_disk_in_pack_is_one_line(tmp_path: Path, detections: Path, capsy
 
 @pytest.mark.parametrize(
     ("error", "said"),
-    [(OSError(5, "Input/output error", "a.bin"), "a.bin: Input/output error"), (MemoryError(), "not enough memory")],
+    [
+        (OSError(5, "Input/output error", "a.bin"), "a.bin: Input/output error"),
+        (MemoryError(), "not enough memory"),
+        (BrokenProcessPool(), "a worker process was ended"),
+    ],
 )
 def test_trouble_of_the_machine_is_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception, said: str
