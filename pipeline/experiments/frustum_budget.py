@@ -20,7 +20,8 @@ class FrustumBudget:
     boxes        2D boxes of the test frames: "labels", a list as Frustum PointNets publishes (rgb_detection_val.txt),
                  or a folder of KITTI result files
     resamples    of the bootstrap over test frames
-    seconds_...  of a step and of completing a frame on one core (torch 2.13, AMD EPYC); no result depends on them
+    seconds_...  of one core, for the plan alone; no result depends on them. Measured is a step of the budget paper
+                 (torch 2.13, AMD EPYC); the others are estimates
     """
 
     train_frames: int
