@@ -7,7 +7,7 @@ whatever the number of loader processes, and after a resume.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from auglidar_base.errors import SettingsError
+from completion.sensor_effects import SensorEffects
 from completion.types import DepthFrame, FloatMap
 from completion.warping import Views, enlarged, turned
 from completion.windows import window_corner, window_intrinsics
@@ -62,6 +63,7 @@ class Augmentation:
     top           rows left out at the top of a frame (published NLSPN on KITTI: 100)
     rotate        largest turn of a frame to either side, degrees (NLSPN: 5)
     scale         largest factor a frame is enlarged by, its depths divided by it (NLSPN: 1.5); 1: none
+    sensor        what a worse camera does to the picture
     """
 
     crop: tuple[int, int] | None = None
@@ -75,6 +77,7 @@ class Augmentation:
     top: int = 0
     rotate: float = 0.0
     scale: float = 1.0
+    sensor: SensorEffects = field(default_factory=SensorEffects)
 
     def __post_init__(self) -> None:
         if self.scale < 1:
@@ -192,7 +195,7 @@ def placed_crop(sample: Sample, augmentation: Augmentation, rng: np.random.Gener
     if augmentation.drop:
         kept = rng.random(sparse.shape) >= rng.uniform(0, augmentation.drop)
         sparse = sparse * kept
-    image = disturb_image(image, augmentation, rng)
+    image = augmentation.sensor.apply(disturb_image(image, augmentation, rng), rng)
     if rng.random() < augmentation.flip:
         sparse, target, image = sparse[:, ::-1], target[:, ::-1], image[:, ::-1]
     corner = window_corner(frame.size, "bottom")

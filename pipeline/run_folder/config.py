@@ -116,10 +116,10 @@ class TrainConfig(LibrarySection):
     network: Literal["completion", "detection", "segmentation"] = Field(
         default="completion", description="what is trained: completion, detection or segmentation"
     )
-    truth: Literal["depth", "held_out_rings"] = Field(
+    truth: Literal["depth", "held_out_rings", "both"] = Field(
         default="depth",
-        description="what completion learns from: the data set's true depth, or the rings of the scan that "
-        "beam_strides keeps back (points, calibration and pictures are enough)",
+        description="what completion learns from: the data set's true depth, the rings of the scan that beam_strides "
+        "keeps back (points, calibration and pictures are enough), or both, three crops of four by rings",
     )
     beam_strides: tuple[int, ...] = Field(
         default=(),
@@ -130,6 +130,15 @@ class TrainConfig(LibrarySection):
         default=None,
         description="completion: folder of frames with true depth in KITTI's layout (`--stage synth` makes one), from "
         "which one sample in three comes, so that the network does not forget them",
+    )
+    photographs: str | None = Field(
+        default=None,
+        description="completion, synthetic frames: folder of photographs that surfaces are covered with anew for every "
+        "other crop, so that the network compares instead of knowing our renderer",
+    )
+    relief: float = Field(
+        default=0.0,
+        description="completion, synthetic frames: share of crops whose ground and crowns are made uneven",
     )
     calibration_jitter: float = Field(
         default=0.0,

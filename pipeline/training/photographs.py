@@ -1,4 +1,4 @@
-"""A folder of photographs as textures: square tiles in sizes from 512 pixels down, which synthetic surfaces are given."""
+"""A folder of photographs as textures for synthetic surfaces: square tiles in sizes from 512 pixels down."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 Measured on real streets, what surprises a network of synthetic ones is grass verges, banks and hedges, not roads
 (docs/synthetic.md). Raising the ground by dh under a camera at height h brings its intersection with a pixel's ray
-nearer, from z to z (1 - dh / h); LiDAR and camera stand close enough that one factor serves the sparse map and the truth.
+nearer, from z to z (1 - dh / h); LiDAR and camera stand close enough that one factor serves sparse map and truth.
 """
 
 from __future__ import annotations

@@ -27,9 +27,7 @@ class RingSamples:
     calibration_jitter: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.beam_strides or min(self.beam_strides) < 2:
-            given = list(self.beam_strides)
-            raise UsageError(f"train.beam_strides: held_out_rings expects numbers from 2, as [2, 4, 8], got {given}")
+        require_rings(self.beam_strides)
         first = self.dataset[0]
         for part in NEEDED:
             if not first.has(part):
@@ -43,6 +41,13 @@ class RingSamples:
         from pipeline.training.held_out_rings import HeldOutRings
 
         return DrawnSample(HeldOutRings.of(self.dataset[index], self.beam_strides, self.calibration_jitter))
+
+
+def require_rings(beam_strides: tuple[int, ...]) -> None:
+    """Raises UsageError for strides that keep no ring back."""
+    if not beam_strides or min(beam_strides) < 2:
+        given = list(beam_strides)
+        raise UsageError(f"train.beam_strides: held_out_rings expects numbers from 2, as [2, 4, 8], got {given}")
 
 
 def held_out_validation(frame: Frame, beam_strides: tuple[int, ...]) -> DepthFrame:

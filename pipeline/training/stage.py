@@ -26,6 +26,7 @@ from pipeline.training.beam_subsampling import RandomBeamSubsampling
 from pipeline.training.rehearsal import Rehearsal
 from pipeline.training.ring_samples import RingSamples, held_out_validation
 from pipeline.training.settings import completion_settings, detection_settings, segmentation_settings
+from pipeline.training.varied_streets import VariedStreets
 
 if TYPE_CHECKING:
     from completion.samples import SampleSource, TrainingSample
@@ -133,7 +134,7 @@ def train_completion(config: Config, dataset: Dataset, out: Path) -> Path:
     from completion.train import train
 
     settings = completion_settings(config)
-    if config.train.truth == "depth":
+    if config.train.truth != "held_out_rings":
         require_depth(dataset, "; train.truth=held_out_rings learns from the scans themselves")
     dataset, held_back = split(dataset, settings)
     samples = completion_samples(dataset, config)
@@ -151,8 +152,12 @@ def require_depth(dataset: Dataset, hint: str = "") -> None:
 def completion_samples(dataset: Dataset, config: Config) -> SampleSource:
     """The frames with what `train.truth` says is their truth, and those of `train.rehearse` between them."""
     section = config.train
-    kind = RingSamples if section.truth == "held_out_rings" else DepthSamples
-    samples = kind(dataset, section.beam_strides, section.calibration_jitter)
+    samples: SampleSource
+    if section.truth == "both" or section.photographs or section.relief:
+        samples = VariedStreets.of(dataset, section)
+    else:
+        kind = RingSamples if section.truth == "held_out_rings" else DepthSamples
+        samples = kind(dataset, section.beam_strides, section.calibration_jitter)
     if section.rehearse is None:
         return samples
     other = open_dataset("kitti_object", section.rehearse)

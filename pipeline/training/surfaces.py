@@ -58,9 +58,12 @@ def find_surfaces(
     face[(instances > 0) | np.isin(semantics, _FACELESS)] = _FRONT
     key = (semantics.astype(np.int64) * 4 + face) * 4096 + instances % 4096
     key[depth <= 0] = -1
-    label = _grown(_components(key, _steps(depth)), depth)
-    first = np.zeros(label.max() + 1, np.int64)
-    first[label.ravel()] = np.arange(label.size)
+    core = _components(key, _steps(depth))
+    # Class and facing of a surface are those of its core; pixels that join it later may be of other ones.
+    labels, pixels = np.unique(core, return_index=True)
+    first = np.zeros(core.max() + 1, np.int64)
+    first[labels] = pixels
+    label = _grown(core, depth)
     return Surfaces(label, points, face.ravel()[first], semantics.ravel()[first].astype(np.int64), float(K[0, 0]))
 
 
@@ -136,7 +139,7 @@ def retextured(image: Image, surfaces: Surfaces, tiles: tuple[Tiles, ...], rng: 
     chosen = label[at]
     colours = _sampled(surfaces, drawn, tiles, at) * drawn.tint[chosen]
     colours *= _shade(image, surfaces.label, rng.uniform(0.3, 1.0)).ravel()[at, None]
-    out = image.reshape(-1, 3).astype(np.float32)
+    out: Float = image.reshape(-1, 3).astype(np.float32)
     opaque = drawn.opaque[chosen, None]
     out[at] = (1 - opaque) * out[at] + opaque * colours
     out = out.reshape(shape)
@@ -193,6 +196,6 @@ def _with_sky(image: Float, sky: NDArray[np.bool_], tiles: tuple[Tiles, ...], rn
     tile = tiles[1][int(rng.integers(len(tiles[1])))]
     height, width = sky.shape
     drawn = cv2.GaussianBlur(cv2.resize(tile, (width, height)), (0, 0), rng.uniform(1, 12))
-    image = image.copy()
-    image[sky] = 0.5 * rng.uniform(0.6, 1.4) * drawn[sky] + 100 * rng.uniform(0.5, 1.3)
-    return image
+    light, bright = 0.5 * rng.uniform(0.6, 1.4), 100 * rng.uniform(0.5, 1.3)
+    found: Float = np.where(sky[..., None], light * drawn + bright, image).astype(np.float32)
+    return found
