@@ -53,6 +53,14 @@ def test_transforms_by_hand() -> None:
     np.testing.assert_allclose(calibration.cam_to_velo(camera), [[10, 2, 1]], atol=1e-12)
 
 
+def test_lidar_points_are_rectified_after_the_step_to_camera_0() -> None:
+    """R0_rect turns by 90 degrees about the vertical (x' = z, z' = -x): no identity hides whether, or when, it acts."""
+    calibration = parse_calibration(OBJECT.replace(f"R0_rect: {R0_LINE}", "R0_rect: 0 0 1 0 1 0 -1 0 0"))
+    # The LiDAR's (10, 2, 1) is (-1.99, -1.08, 9.73) in camera 0.
+    np.testing.assert_allclose(calibration.velo_to_cam(np.array([[10.0, 2.0, 1.0]])), [[9.73, -1.08, 1.99]])
+    np.testing.assert_allclose(calibration.cam_to_velo(np.array([[9.73, -1.08, 1.99]])), [[10, 2, 1]], atol=1e-12)
+
+
 def test_a_crop_moves_the_principal_point() -> None:
     cropped = parse_calibration(OBJECT).cropped(top=20, left=50)
     point = np.array([[1.0, 2.0, 8.0]])
