@@ -135,7 +135,7 @@ DAMAGE: dict[str, tuple[Damage, str]] = {
     "cloud: a link to itself": (_link("velodyne", ".bin", lambda path: path), "symbolic link"),
     "cloud: link out of the data": (_link("velodyne", ".bin", _out_of_root), "a link out of it"),
     "cloud: a pipe": (_pipe, "a device or pipe"),
-    "cloud: absurd size": (_sparse, "a file of 100.0 GB"),
+    "cloud: absurd size": (_sparse, "got 100,000.0 MB"),
     "cloud and image: swapped": (_swapped, "points with NaN or infinite values"),
     "image: empty": (_bytes("image_2", ".png", lambda data: b""), "an empty file"),
     "image: truncated": (_bytes("image_2", ".png", lambda data: data[:3000]), "a file that ends after 3000 bytes"),
