@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -28,10 +29,7 @@ class RingSamples:
 
     def __post_init__(self) -> None:
         require_rings(self.beam_strides)
-        first = self.dataset[0]
-        for part in NEEDED:
-            if not first.has(part):
-                raise UsageError(f"{self.dataset.root}: frame {first.id} has no {part} to hold rings out of")
+        require_parts(self.dataset, NEEDED, " to hold rings out of")
 
     def __len__(self) -> int:
         return len(self.dataset)
@@ -41,6 +39,14 @@ class RingSamples:
         from pipeline.training.held_out_rings import HeldOutRings
 
         return DrawnSample(HeldOutRings.of(self.dataset[index], self.beam_strides, self.calibration_jitter))
+
+
+def require_parts(dataset: Dataset, parts: Sequence[str], what_for: str) -> None:
+    """Raises UsageError, ending in `what_for`, when the first frame lacks a part."""
+    first = dataset[0]
+    for part in parts:
+        if not first.has(part):
+            raise UsageError(f"{dataset.root}: frame {first.id} has no {part}{what_for}")
 
 
 def require_rings(beam_strides: tuple[int, ...]) -> None:

@@ -5,20 +5,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.errors import UsageError
 from pipeline.data import Dataset, Frame
 from pipeline.training.beam_subsampling import RandomBeamSubsampling
 from pipeline.training.held_out_rings import HeldOutRings
-from pipeline.training.photographs import Tiles, read_photographs
+from pipeline.training.photographs import read_photographs
 from pipeline.training.relief import relief
-from pipeline.training.ring_samples import require_rings
-from pipeline.training.surfaces import find_surfaces, retextured
+from pipeline.training.ring_samples import require_parts, require_rings
+from pipeline.training.surfaces import Surfaces, find_surfaces, retextured
 
 if TYPE_CHECKING:
     from completion.samples import DrawnSample
@@ -51,11 +51,9 @@ class VariedStreets:
     def of(cls, dataset: Dataset, section: TrainConfig) -> VariedStreets:
         """Raises UsageError for a data set without the parts of a synthetic frame, strides that `truth` cannot use, and
         a folder without photographs."""
-        first = dataset[0]
-        for part in NEEDED:
-            if not first.has(part):
-                asked = "train.photographs, train.relief and train.truth=both are for synthetic frames"
-                raise UsageError(f"{dataset.root}: frame {first.id} has no {part}; {asked}")
+        require_parts(
+            dataset, NEEDED, "; train.photographs, train.relief and train.truth=both are for synthetic frames"
+        )
         if section.truth != "depth":
             require_rings(section.beam_strides)
         photographs = None if section.photographs is None else Path(section.photographs)
@@ -73,25 +71,37 @@ class VariedStreets:
         frame = self.dataset[index]
         dense = RandomBeamSubsampling.of(frame, tuple({1, *self.beam_strides}), self.calibration_jitter)
         rings = HeldOutRings.of(frame, self.beam_strides, self.calibration_jitter) if self.by_rings else None
-        tiles = None if self.photographs is None else read_photographs(self.photographs)
+        picture = self._pictures(frame)
 
         def draw(rng: np.random.Generator) -> DepthFrame:
             by_rings = rings is not None and rng.random() < self.by_rings
             drawn = rings(rng) if by_rings and rings is not None else _with_dense_truth(frame, dense(rng))
-            return self._varied(drawn, frame, tiles, rng)
+            return self._varied(drawn, frame, picture(rng), rng)
 
         return DrawnSample(draw)
 
+    def _pictures(self, frame: Frame) -> Callable[[np.random.Generator], NDArray[np.uint8]]:
+        """Draws the frame's picture; its surfaces are found once, however many crops it gives."""
+        if self.photographs is None:
+            return lambda rng: frame.image
+        tiles = read_photographs(self.photographs)
+
+        @cache
+        def surfaces() -> Surfaces:
+            return find_surfaces(frame.target_depth, frame.semantics, frame.instances, frame.calibration.K)
+
+        def picture(rng: np.random.Generator) -> NDArray[np.uint8]:
+            return retextured(frame.image, surfaces(), tiles, rng) if rng.random() < PHOTOGRAPHED else frame.image
+
+        return picture
+
     def _varied(
-        self, drawn: DepthFrame, frame: Frame, tiles: tuple[Tiles, ...] | None, rng: np.random.Generator
+        self, drawn: DepthFrame, frame: Frame, image: NDArray[np.uint8], rng: np.random.Generator
     ) -> DepthFrame:
         from completion.types import DepthFrame
 
-        image, sparse, target, K = frame.image, drawn.sparse, drawn.target, frame.calibration.K
+        sparse, target, K = drawn.sparse, drawn.target, frame.calibration.K
         assert target is not None
-        if tiles is not None and rng.random() < PHOTOGRAPHED:
-            surfaces = find_surfaces(frame.target_depth, frame.semantics, frame.instances, K)
-            image = retextured(image, surfaces, tiles, rng)
         if rng.random() < self.relief:
             factor = relief(frame.target_depth, frame.semantics, K, rng)
             sparse, target = sparse * factor, target * factor

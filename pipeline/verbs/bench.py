@@ -101,13 +101,9 @@ def run(args: argparse.Namespace) -> int:
     if masks and labelled:
         found["masks"] = mask_scores(dataset, masks, progress)
     tables = _tables(found)
-    print(json.dumps(found, indent=1) if args.json else tables)
+    _give(found, tables, args, "real")
     if args.out:
-        folder = Path(args.out)
-        folder.mkdir(parents=True, exist_ok=True)
-        write_text(folder / "real.json", json.dumps(found, indent=1))
-        write_text(folder / "real.md", tables)
-        _plot(folder, found["completion"])
+        _plot(Path(args.out), found["completion"])
     return 0
 
 
@@ -174,13 +170,19 @@ def _edges(dataset: Dataset, args: argparse.Namespace, progress: Callable[[str],
 
     found = edge_ceiling(dataset, row_numbers(args.rows), progress)
     tables = ceiling_tables(found)
-    print(json.dumps(found, indent=1) if args.json else tables)
+    _give(found, tables, args, "edges")
+    return 0
+
+
+def _give(found: Any, tables: str, args: argparse.Namespace, name: str) -> None:
+    """Prints what was found as tables or JSON; with --out both go into NAME.md and NAME.json there."""
+    text = json.dumps(found, indent=1)
+    print(text if args.json else tables)
     if args.out:
         folder = Path(args.out)
         folder.mkdir(parents=True, exist_ok=True)
-        write_text(folder / "edges.json", json.dumps(found, indent=1))
-        write_text(folder / "edges.md", tables)
-    return 0
+        write_text(folder / f"{name}.json", text)
+        write_text(folder / f"{name}.md", tables)
 
 
 def _plot(folder: Path, entries: list[dict[str, Any]]) -> None:
